@@ -16,7 +16,6 @@ from paper_page import CONFIGS, SHAPES, rewrite_table
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 
 SCRIPT = "paper_g.py"
@@ -66,7 +65,7 @@ def deviation(run: Reconstruction) -> float:
     found = Uncertainty(run, seed=0)
     while found.count < EXPERIMENTS:
         found.step()
-    return Deviations(found).numbers()["g"]["deviation"]
+    return found.numbers()["g"]["deviation"]
 
 
 def main() -> None:

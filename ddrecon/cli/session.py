@@ -44,6 +44,9 @@ class Session:
     torch is set up where a scene is built, not before: what is wrong with its file is said at once.
     """
 
+    output: Path = None  # type: ignore[assignment]  # of commands that write none
+    overwrite: bool = False
+    resume: bool = False
     overrides: tuple[str, ...] = ()
     device: str = "cpu"
     engine: str | None = None
@@ -119,13 +122,11 @@ class Session:
         file = path / RESULT if os.path.isdir(path) else path
         return read_scene(file, self.overrides, self.options)
 
-    def claim(
-        self, path: Path, kind: str, *, overwrite: bool, resume: bool = False
-    ) -> AbstractContextManager[Folder | None]:
-        """The folder `path` of a job of this `kind`, claimed; None where another rank has it."""
+    def claim(self, kind: str) -> AbstractContextManager[Folder | None]:
+        """The output folder of a job of this `kind`, claimed; None where another rank has it."""
         if not is_first():
             return nullcontext()
-        return claim_folder(path, kind, overwrite=overwrite, resume=resume)
+        return claim_folder(self.output, kind, overwrite=self.overwrite, resume=self.resume)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.
@@ -164,6 +165,8 @@ class Session:
         if not is_first():
             return
         prints_json = self.report == STDOUT
+        if self.output is not None:
+            lines = [*lines, f"written to {self.output}, {monotonic() - self.begun:.1f} s in all"]
         click.echo(json.dumps(report, indent=1) if prints_json else "\n".join(lines))
         if self.report is not None and not prints_json:
             write_json(self.report, report)

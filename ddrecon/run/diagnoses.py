@@ -1,12 +1,9 @@
-"""What seems to be wrong with a run, by its pictures and its search.
-
-Each function returns a sentence, with what to do, or None where there is nothing to say.
-"""
+"""What seems to be wrong with a run, by its pictures and its search: sentences, with what to do."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any
 
@@ -25,14 +22,14 @@ GAIN = 1.15
 """A view whose brightness is off by this factor, against the others, was exposed differently."""
 SHIFT = 0.5
 """A render that fits better when moved by more pixels was seen by another camera."""
-EXPLAINED = 0.3
-"""The part of a residual that a factor has to explain."""
-MOVED = 0.2
-"""The part that such a move has to explain: a volume fitted to other views hides the rest."""
+EXPLAINED, MOVED = 0.3, 0.2
+"""The parts of a residual that a factor and a move have to explain; a volume that was fitted to the
+other views hides some of a move."""
 GHOSTS = 0.01
 """Views held out are worse for density where no picture shows smoke, from this part of it on."""
 WORTHWHILE = 0.1
 """A run is unfinished where its loss can fall by this part of it."""
+MOST_NAMED = 4
 
 
 def diagnose(
@@ -50,51 +47,50 @@ def diagnose(
     `support` is where density was sought, which is `described`. Each is a word that names its
     `kind`, and a sentence, its `text`.
     """
-    seen = [view for view in scene.views if view.image is not None]
-    trained = [view for view in seen if not view.is_test]
     described = described or {}
+    train = [v for v in scene.views if v.image is not None and not v.is_test]
     ghosts = find_ghosts(scene.volume, described["box"]) if "box" in described else None
-    overfit, doubt = find_overfit(seen, quality, ghosts), described.get("doubt")
+    overfit, doubt = find_overfit(quality, scene.views, ghosts), described.get("doubt")
     if support is not None:
         doubt = f"volume.bounds? {doubt}" if doubt else find_cut(support, scene.volume.grid)
-    gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
+    gains = list[float]()
+    for view in train:
+        image = images[view.name]
+        (change,), _ = explain(view, target_of(view) - image, image[None])
+        gains.append(max(1 + change, 1e-12))
     usual = median(gains) if len(gains) > 2 else 1.0
     # What is not yet explained is no picture's fault as long as going on may explain it. It is all
     # where a run is too short to tell, and where renders as a whole lack the usual gain.
     to_come = min(gain, 1.0) if abs(math.log(usual)) <= math.log(GAIN) else 1.0
-    least = max(EXPLAINED, to_come)
-    texts = {
-        "overfit": overfit,
-        "support": doubt,
-        "exposure": find_exposure(trained, images, usual, least),
-        "cameras": find_shift(trained, images, max(MOVED, to_come)),
-        # What is overfit would only become more so.
-        "unfinished": None if overfit else find_unfinished(gain, iteration),
-    }
+    least = max(EXPLAINED, to_come), max(MOVED, to_come)
+    # What is overfit would only become more so.
+    unfinished = None if overfit else find_unfinished(gain, iteration)
+    texts = {"overfit": overfit, "support": doubt}
+    texts |= find_odd(train, images, usual, least) | {"unfinished": unfinished}
     return [{"kind": kind, "text": text} for kind, text in texts.items() if text is not None]
 
 
 def find_overfit(
-    views: Sequence[View], quality: Mapping[str, Mapping[str, float]], ghosts: str | None
+    quality: Mapping[str, Mapping[str, float]], views: Sequence[View], ghosts: str | None
 ) -> str | None:
     """Whether views that were held out are far worse than those trained on, perhaps by `ghosts`."""
-    test, train = (
-        [quality[v.name]["psnr"] for v in views if v.is_test is k] for k in (True, False)
-    )
-    if not test or not train or mean(train) - mean(test) < OVERFIT:
+    psnrs: dict[bool, list[float]] = {True: [], False: []}
+    for view in views:
+        if view.image is not None:
+            psnrs[view.is_test].append(quality[view.name]["psnr"])
+    if not all(psnrs.values()) or mean(psnrs[False]) - mean(psnrs[True]) < OVERFIT:
         return None
-    advice = ghosts or "raise optimize.parameters.density.tv"
     return (
-        f"overfit: views held out are {mean(train) - mean(test):.1f} dB worse than those trained "
-        f"on; {advice}, add views, or look for cameras that are off"
+        f"overfit: views held out are {mean(psnrs[False]) - mean(psnrs[True]):.1f} dB worse than "
+        f"those trained on; {ghosts or 'raise optimize.parameters.density.tv'}, add views, or look "
+        "for cameras that are off"
     )
 
 
 def find_ghosts(volume: Volume, box: Sequence[Sequence[float]]) -> str | None:
     """Whether density is where few cameras look: outside the `box` (x, y, z) of what all show."""
-    centers = reversed(volume.grid.centers(volume.density))
     inside = torch.ones_like(volume.density, dtype=torch.bool)
-    for places, low, high in zip(centers, *box, strict=True):
+    for places, low, high in zip(reversed(volume.grid.centers(volume.density)), *box, strict=True):
         inside &= (low <= places) & (places <= high)
     share = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
     if share < GHOSTS:
@@ -105,43 +101,39 @@ def find_ghosts(volume: Volume, box: Sequence[Sequence[float]]) -> str | None:
     )
 
 
-def find_exposure(
-    views: Sequence[View], images: Mapping[str, Tensor], usual: float, least: float
-) -> str | None:
-    """Whether some picture is brighter or darker, as a whole, than by the `usual` gain.
+def find_odd(
+    views: Sequence[View],
+    images: Mapping[str, Tensor],
+    usual: float = 1.0,
+    least: tuple[float, float] = (EXPLAINED, MOVED),
+) -> dict[str, str]:
+    """Which renders, of `images`, fit the pictures of `views` better by a factor, or when moved.
 
-    A factor is to explain more than the part `least` of what the picture leaves.
+    Factors count from the `usual` one. A factor, and a move, is to explain more than the part
+    `least` of what a picture leaves.
     """
-    odd = {}
+    odd: dict[str, dict[str, float]] = {"exposure": {}, "cameras": {}}
     for view in views:
-        gain, explained = _gain(view, images[view.name], usual)
-        if abs(math.log(gain / usual)) > math.log(GAIN) and explained > least:
-            odd[view.name] = gain / usual
-    if not odd:
-        return None
-    return (
-        "exposure? pictures brighter or darker, as a whole, than the others say: "
-        f"{_name_worst(odd, '.2f', 'times', lambda gain: abs(math.log(gain)))}; give "
-        "all one exposure and white balance, or optimize them (views.*.exposure)"
-    )
-
-
-def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
-    """Whether renders fit their pictures better when moved: residuals go with the parallax.
-
-    Moves are to explain more than the part `least` of them.
-    """
-    moves = {}
-    for view in views:
-        (right, down), explained = best_shift(view, images[view.name])
-        if math.hypot(right, down) > SHIFT and explained > least:
-            moves[view.name] = math.hypot(right, down)
-    if not moves:
-        return None
-    return (
-        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels', abs)}; "
-        "check poses and intrinsics, or optimize the poses (views.NAME.camera)"
-    )
+        image = images[view.name]
+        (change,), explained = explain(view, target_of(view) - usual * image, image[None])
+        gain = max(1 + change / usual, 1e-12)
+        if abs(math.log(gain)) > math.log(GAIN) and explained > least[0]:
+            odd["exposure"][view.name] = gain
+        move, explained = best_shift(view, image)
+        if math.hypot(*move) > SHIFT and explained > least[1]:
+            odd["cameras"][view.name] = math.hypot(*move)
+    gains, moves = odd["exposure"].items(), odd["cameras"].items()
+    brightest = sorted(gains, key=lambda item: -abs(math.log(item[1])))[:MOST_NAMED]
+    farthest = sorted(moves, key=lambda item: -item[1])[:MOST_NAMED]
+    texts = {
+        "exposure": "exposure? pictures brighter or darker, as a whole, than the others say: "
+        + ", ".join(f"{name} ({gain:.2f} times)" for name, gain in brightest)
+        + "; give all one exposure and white balance, or optimize them (views.*.exposure)",
+        "cameras": "cameras? renders fit better when moved: "
+        + ", ".join(f"{name} ({pixels:.1f} pixels)" for name, pixels in farthest)
+        + "; check poses and intrinsics, or optimize the poses (views.NAME.camera)",
+    }
+    return {kind: text for kind, text in texts.items() if odd[kind]}
 
 
 def find_unfinished(gain: float, iteration: int) -> str | None:
@@ -158,50 +150,32 @@ def find_unfinished(gain: float, iteration: int) -> str | None:
     )
 
 
-def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
+def best_shift(view: View, image: Tensor) -> tuple[list[float], float]:
     """The shift in pixels (right, down) by which the render `image` [3, h, w] fits best.
 
     Also returns the part of the residual to the picture of `view` that the shift explains. The
     shift is one Gauss-Newton step: the residual is fitted by the derivatives of the render along
     both axes (central differences; Lucas and Kanade 1981).
     """
-    target, weight = target_of(view), _weight(view)
-    if min(image.shape[1:]) < 3:
-        return (0.0, 0.0), 0.0
-    inner = (slice(None), slice(1, -1), slice(1, -1))
-    residual = ((target - image) * weight)[inner].double().flatten()
     # A render moved to the right by d is r(x - d): it changes by -d times its derivative.
-    right = (image[:, 1:-1, :-2] - image[:, 1:-1, 2:]) / 2 * weight[..., 1:-1, 1:-1]
-    down = (image[:, :-2, 1:-1] - image[:, 2:, 1:-1]) / 2 * weight[..., 1:-1, 1:-1]
-    slopes = torch.stack([right.double().flatten(), down.double().flatten()])
-    normal, total = slopes @ slopes.T, float(residual @ residual)
-    if total == 0 or float(torch.linalg.det(normal)) <= 1e-9 * float(normal.trace()) ** 2:
-        return (0.0, 0.0), 0.0
-    move = torch.linalg.solve(normal, slopes @ residual)
-    left = residual - move @ slopes
-    return (float(move[0]), float(move[1])), 1 - float(left @ left) / total
+    slopes = torch.zeros(2, *image.shape).to(image)
+    slopes[0, :, 1:-1, 1:-1] = (image[:, 1:-1, :-2] - image[:, 1:-1, 2:]) / 2
+    slopes[1, :, 1:-1, 1:-1] = (image[:, :-2, 1:-1] - image[:, 2:, 1:-1]) / 2
+    residual = torch.zeros_like(image)
+    residual[:, 1:-1, 1:-1] = (target_of(view) - image)[:, 1:-1, 1:-1]
+    return explain(view, residual, slopes)
 
 
-def _gain(view: View, image: Tensor, usual: float) -> tuple[float, float]:
-    """The factor on the render of `view` that fits its picture best, by least squares.
+def explain(view: View, residual: Tensor, slopes: Tensor) -> tuple[list[float], float]:
+    """The factors of `slopes` [n, 3, h, w] that fit a `residual` [3, h, w] best, by least squares.
 
-    And the part that it explains of what the `usual` factor leaves.
+    And the part of it that they explain. Pixels count where the mask of `view` is not black.
     """
-    weight = _weight(view)
-    picture, render = ((x * weight).double().flatten() for x in (target_of(view), image))
-    left, power = picture - usual * render, float(render @ render) or 1e-30
-    change = float(left @ render) / power
-    return max(usual + change, 1e-12), change**2 * power / max(float(left @ left), 1e-30)
-
-
-def _weight(view: View) -> Tensor:
-    """1 where a pixel counts, [1, h, w]."""
-    return torch.ones_like(target_of(view)[:1]) if view.mask is None else view.mask[None]
-
-
-def _name_worst(
-    numbers: Mapping[str, float], form: str, unit: str, size: Callable[[float], float]
-) -> str:
-    """At most four of `numbers`, by name: those of the largest `size`, that one first."""
-    worst = sorted(numbers.items(), key=lambda item: -size(item[1]))[:4]
-    return ", ".join(f"{name} ({number:{form}} {unit})" for name, number in worst)
+    weight, count = 1.0 if view.mask is None else view.mask, len(slopes)
+    slopes, residual = (slopes * weight).double().flatten(1), (residual * weight).double().flatten()
+    normal, total = slopes @ slopes.T, float(residual @ residual)
+    if total == 0 or float(torch.linalg.det(normal)) <= 1e-9 * float(normal.trace()) ** count:
+        return [0.0] * count, 0.0
+    factors = torch.linalg.solve(normal, slopes @ residual)
+    left = residual - factors @ slopes
+    return factors.tolist(), 1 - float(left @ left) / total

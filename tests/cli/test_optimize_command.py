@@ -179,7 +179,7 @@ def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(
     assert page.count('class="step"') == 2 and f"finer from there ({step})" in page
     of_all, of_iterations = (
         float(re.search(words, told.stdout).group(1))
-        for words in (r"and (\S+) s with all", r"iterations in (\S+) s")
+        for words in (r"(\S+) s in all", r"iterations in (\S+) s")
     )
     assert of_iterations < of_all <= taken + 0.1
 
@@ -191,7 +191,7 @@ def test_what_takes_long_before_and_after_the_bar_is_told(
     assert "..." not in run("optimize", "scene.yaml", "-o", "short").stderr
     monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
     told = run("optimize", "scene.yaml", "-o", "long").stderr
-    stages = ("reading pictures", "looking at what", "optimize:", "rendering what was found")
+    stages = ("reading pictures", "looking at what", "optimize:", "writing what was found")
     places = [told.index(stage) for stage in stages]
     assert places == sorted(places) and run(*OPTIMIZE, "quiet").stderr == ""
 

@@ -160,9 +160,12 @@ def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     assert "neither absorbed nor left" in succeed("balance", "scene.yaml").stdout
 
 
-def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
+def test_a_ring_is_a_movie_of_the_volume_from_around(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import imageio.v3 as iio
 
+    monkeypatch.setattr("ddrecon.run.render_folder.FEW", 4)
     said = succeed(*RENDER, "--ring", "5", "--view", "front").stdout
     report = json.loads(Path("out/render.json").read_text())
     movie = iio.imread("out/ring.png", index=..., plugin="pillow")[..., :3]

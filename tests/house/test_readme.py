@@ -42,7 +42,7 @@ def test_there_are_commands_and_scenes() -> None:
 
 @pytest.mark.parametrize("line", dict.fromkeys(commands()))
 def test_a_command_is_understood(line: str) -> None:
-    assert (ROOT / parsed(line).params["scene"]).is_file()
+    assert (ROOT / parsed(line).params["source"]).is_file()
 
 
 @pytest.mark.parametrize("text", scenes())

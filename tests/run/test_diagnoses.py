@@ -14,13 +14,7 @@ from ddrecon.losses import Target
 from ddrecon.picture import render
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support
-from ddrecon.run.diagnoses import (
-    best_shift,
-    diagnose,
-    find_exposure,
-    find_shift,
-    find_unfinished,
-)
+from ddrecon.run.diagnoses import best_shift, diagnose, find_odd, find_unfinished
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
@@ -222,8 +216,8 @@ def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
     views: Sequence[View], told: str
 ) -> None:
     images = {view.name: blob() for view in views}
-    texts = find_exposure(views, images, 1.0, 0.3), find_shift(views, images, 0.3)
-    found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", " ".join(filter(None, texts))))
+    texts = " ".join(find_odd(views, images, 1.0, (0.3, 0.3)).values())
+    found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", texts))
     assert found == told
 
 
