@@ -87,22 +87,8 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> T
     low, high = (list(corner) for corner in grid.bounds_xyz)
     cells, sides = list(reversed(grid.shape)), list(reversed(grid.spacing))
     lines = [f"grid: {sizes_text(cells)} cells of {sizes_text(sides)} u, from {low} to {high}"]
-    lines.append(f"views: {len(scene.views)}")
-    views = list[dict[str, Any]]()
-    for view in scene.views:
-        camera = view.camera
-        told = {
-            "name": view.name,
-            "camera": "perspective" if camera.is_perspective else "orthographic",
-            "width": camera.size[1],
-            "height": camera.size[0],
-            "split": "test" if view.is_test else "train",
-            "has_image": view.image is not None,
-            "cell": cell_width(grid, camera),
-        }
-        views.append(told)
-        text = "  {name}: {camera}, {width} x {height} pixels, {split}".format(**told)
-        lines.append(text + (", with image" if told["has_image"] else ""))
+    views, texts = _describe_views(scene)
+    lines += [f"views: {len(views)}", *texts]
     widths = [view["cell"] for view in views]
     report: dict[str, Any] = {
         "resolution": cells,
@@ -136,6 +122,26 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> T
         whole = f"at most {count * seconds / 60:.2g} minutes for {count}"
         lines.append(f"time: about {seconds:.2g} s an iteration at full resolution, {whole}")
     return report, lines
+
+
+def _describe_views(scene: Scene) -> tuple[list[dict[str, Any]], list[str]]:
+    """What is told of each view, and a line of it."""
+    views, lines = list[dict[str, Any]](), list[str]()
+    for view in scene.views:
+        camera = view.camera
+        told = {
+            "name": view.name,
+            "camera": "perspective" if camera.is_perspective else "orthographic",
+            "width": camera.size[1],
+            "height": camera.size[0],
+            "split": "test" if view.is_test else "train",
+            "has_image": view.image is not None,
+            "cell": cell_width(scene.volume.grid, camera),
+        }
+        views.append(told)
+        text = "  {name}: {camera}, {width} x {height} pixels, {split}".format(**told)
+        lines.append(text + (", with image" if told["has_image"] else ""))
+    return views, lines
 
 
 def _advise_on_cells(width: float) -> str:

@@ -186,7 +186,8 @@ def _run(function: Callable[..., None], is_shared: bool, values: dict[str, Any])
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = {field.name for field in fields(Session)} & values.keys()
-    session = Session(**{name: values.pop(name) for name in common})
+    said = {name: values.pop(name) for name in common}
+    session = Session(**{name: value for name, value in said.items() if value is not None})
     with show_warnings():
         if session.report is not None:
             require_folder_of(session.report)

@@ -169,6 +169,8 @@ def optimize(
     for name, option in {"frames": "frames", "shared": "shared", "exported": "export"}.items():
         if of_film[name] is not None:
             raise click.UsageError(f"--{option} is for films: SCENE has no section frames")
+    import torch
+
     from ddrecon.diffusion.solve import name_kernels
     from ddrecon.io.files.folders import RUN
     from ddrecon.progress import tell
@@ -179,7 +181,8 @@ def optimize(
     with session.claim(RUN) as folder:
         with tell("reading pictures and building the scene", quiet):
             if scene_file.tree.diffusion.is_conservative_p1:
-                name_kernels(session.empty())
+                dtype, place = getattr(torch, session.dtype), session.start()
+                name_kernels(torch.empty(0, dtype=dtype, device=place))
             scene, environment = session.build(scene_file), session.environment()
         job = Run(scene, scene_file, environment, preview_every, quiet)
         told = work(job, folder, is_resumed=session.resume, is_quiet=quiet)

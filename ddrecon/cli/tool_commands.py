@@ -73,10 +73,11 @@ def bench(session: Session, source: Path | None, is_quick: bool, is_hard: bool) 
     if is_hard and (source is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     scene_file = None if source is None else session.read(source)
+    from ddrecon.cli.session import NOWHERE
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import BENCH
 
-    with nullcontext() if session.output is None else session.claim(BENCH) as folder:
+    with nullcontext() if session.output == NOWHERE else session.claim(BENCH) as folder:
         if folder is not None:
             folder.clear()
         if is_hard:

@@ -12,7 +12,8 @@ import json
 import os
 import warnings
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Protocol
@@ -24,7 +25,7 @@ from ddrecon.errors import DataWarning, DivergenceError, FormatError, RanksError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.io.files.folders import Folder
-from ddrecon.progress import BAR, Progress, bar_settings, tell
+from ddrecon.progress import BAR, Progress, bar_settings, show_progress, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
@@ -108,12 +109,9 @@ def work(job: Job, folder: Folder | None, *, is_resumed: bool, is_quiet: bool) -
         return {}, []
     leave_ranks()  # what is left the first rank does by itself
 
-    def show(items: Sequence[Any], text: str) -> Iterable[Any]:
-        return tqdm(items, desc=text, leave=False, **bar_settings(is_quiet))
-
     try:
         with tell(f"{job.title}: writing what was found, with its report", is_quiet):
-            return job.finish(show)
+            return job.finish(partial(show_progress, is_quiet=is_quiet))
     except KeyboardInterrupt:
         count_text = f"after {job.iteration} iterations"
         raise KeyboardInterrupt(f"{count_text}; write its results with --resume") from None

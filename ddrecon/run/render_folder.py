@@ -119,10 +119,7 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
 def render_to_folder(
     scene: Scene, views: Sequence[View], folder: Path, choice: Choice, progress: Progress
 ) -> Told:
-    """Renders `views` of `scene` to `folder`, with a record; the first rank alone writes and tells.
-
-    The record is written to `render.json` as well.
-    """
+    """Renders `views` of `scene` to `folder`, with `render.json`; the first rank alone tells."""
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
     components = ["", *(COMPONENTS if choice.components else ())]
@@ -141,15 +138,10 @@ def render_to_folder(
         for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
-            seconds[view.name], stem = elapsed, folder / view.name
+            seconds[view.name] = elapsed
             slopes = {n.removeprefix(GRADIENT): images.pop(n) for n in names if GRADIENT in n}
-            files[view.name] = _write_images(stem, images)
-            if slopes:
-                stem = stem.with_name(stem.name + GRADIENT)
-                shown = {name: diverging(slope) for name, slope in slopes.items()}
-                scales |= {stem.name + name: full for name, (_, full) in shown.items()}
-                previews = {name: preview for name, (preview, _) in shown.items()}
-                files[view.name] += _write_images(stem, slopes, previews)
+            files[view.name] = _write_images(folder / view.name, images)
+            files[view.name] += _write_slopes(folder / f"{view.name}{GRADIENT}", slopes, scales)
             if view.image is not None:
                 target = Target.of(view.image, view.mask, "display" if view.step else "l2")
                 quality[view.name] = float(target.psnr_of(images[""]))
@@ -163,14 +155,7 @@ def render_to_folder(
         "preview": PREVIEW,
         "psnr": quality,
     }
-    lines = []
-    for name, written in files.items():
-        psnr = f", PSNR {quality[name]:.1f} dB" if name in quality else ""
-        lines.append(f"{name}: {', '.join(written)} ({seconds[name]:.2f} s{psnr})")
-    if len(lines) > FEW:
-        lines[1:-1] = [f"... {len(lines) - 2} views between them, in render.json"]
-    if not any(file.endswith(".exr") for written in files.values() for file in written):
-        lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
+    lines = _tell_views(files, seconds, quality)
     if rounds := [r for r in memory.records if r.kind == "rounds"]:
         tolerance = scene.diffusion.transport_tolerance
         last = {"count": rounds[-1].iterations, "residual": float(rounds[-1].residual)}
@@ -189,6 +174,21 @@ def render_to_folder(
         lines.append(f"movie: {movie} (radiance {white:.3g} is white)")
     write_json(folder / "render.json", record)
     return record, lines
+
+
+def _tell_views(
+    files: Mapping[str, Sequence[str]], seconds: Mapping[str, float], quality: Mapping[str, float]
+) -> list[str]:
+    """A line of each view, of many of the first and the last, and one where no .exr is written."""
+    lines = []
+    for name, written in files.items():
+        psnr = f", PSNR {quality[name]:.1f} dB" if name in quality else ""
+        lines.append(f"{name}: {', '.join(written)} ({seconds[name]:.2f} s{psnr})")
+    if len(lines) > FEW:
+        lines[1:-1] = [f"... {len(lines) - 2} views between them, in render.json"]
+    if not any(file.endswith(".exr") for written in files.values() for file in written):
+        lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
+    return lines
 
 
 def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
@@ -228,6 +228,15 @@ def _write_images(
             write_preview(written[-1], previews.get(name, array))
     written = write_picture(stem, picture, previews.get(""), layers) + written
     return [path.name for path in written]
+
+
+def _write_slopes(stem: Path, slopes: Mapping[str, Tensor], scales: dict[str, float]) -> list[str]:
+    """As `_write_images`, of derivatives, if any; the values of full red are added to `scales`."""
+    if not slopes:
+        return []
+    shown = {name: diverging(slope) for name, slope in slopes.items()}
+    scales |= {stem.name + name: full for name, (_, full) in shown.items()}
+    return _write_images(stem, slopes, {name: preview for name, (preview, _) in shown.items()})
 
 
 def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> float:

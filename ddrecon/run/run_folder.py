@@ -27,9 +27,8 @@ from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.job import CHECKPOINTS, Job, Told, fingerprint, load_checkpoint, restore
-from ddrecon.run.quality import Findings, describe_loss, find_results, loss_text
+from ddrecon.run.quality import Findings, describe_loss, diagnose, find_results, loss_text
 from ddrecon.run.report import FINER, GOES_ON, list_numbers, psnr_text, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
 from ddrecon.scene import Scene
@@ -41,15 +40,7 @@ from ddrecon.scene_file.load import (
     referenced_files,
     scene_text,
 )
-from ddrecon.variables.kinds import (
-    CROSS_SECTIONS,
-    EXTINCTION_AND_ALBEDO,
-    PHASE,
-    RESPONSE,
-    is_of_volume,
-    kind_of,
-    split_name,
-)
+from ddrecon.variables.kinds import CROSS_SECTIONS, PHASE, is_of_volume, kind_of, split_name
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
 PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
@@ -188,8 +179,8 @@ class Run(Iterations):
         seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
             summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
-        results = scene, findings.images, findings.quality, run.iteration, run.search.gain
-        summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
+        fall, doubt = (run.iteration, run.search.gain), summary.get("support", {}).get("doubt")
+        summary["diagnoses"] = diagnose(findings, *fall, support, doubt)
         self._report(findings, summary)
         write_json(path / SUMMARY, summary)
         lines = [
@@ -271,10 +262,10 @@ def write_previews(folder: Path, findings: Findings, mark: str) -> None:
     """Writes middle slices of fields, and views beside their targets, to previews/NAMEmark.png."""
     for name, value in fields_of(findings.scene).items():
         write_preview(folder / "previews" / f"{name}.slices{mark}.png", slices(value))
-    for view in findings.scene.views:
-        if view.image is not None:
-            shown = comparison(view.image, findings.images[view.name])
-            write_preview(folder / "previews" / f"{view.name}{mark}.png", shown)
+    for view in findings.seen:
+        assert view.image is not None
+        shown = comparison(view.image, findings.images[view.name])
+        write_preview(folder / "previews" / f"{view.name}{mark}.png", shown)
 
 
 def write_scene(scene_file: SceneFile, folder: Path) -> None:
@@ -299,21 +290,14 @@ def _list_parameters(folder: Path, scene: Scene, stored: Mapping[str, Any]) -> d
 
     Maps become files of their own, but for those that are `stored`.
     """
-    parameters, coefficients = dict[str, Any](), ("density", *EXTINCTION_AND_ALBEDO)
+    parameters = dict[str, Any]()
     for name in variable_names(scene):
-        is_light, value = name.startswith(("lights.", "ground.")), value_of(scene, name)
-        if is_light and value.ndim >= 3:
-            parameters[name] = stored.get(name) or _store(folder, scene, name)
-        elif is_light or (
-            is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
-        ):
+        value = value_of(scene, name)
+        if value.ndim < 3:
             parameters[name] = value.tolist()
-    parameters |= poses_of(scene, [f"views.{view.name}.camera" for view in scene.views])
-    for view in scene.views:
-        for key in RESPONSE:
-            if (value := getattr(view, key)) is not None:
-                parameters[f"views.{view.name}.{key}"] = value.tolist()
-    return parameters
+        elif not kind_of(name).is_cellwise:
+            parameters[name] = stored.get(name) or _store(folder, scene, name)
+    return parameters | poses_of(scene, parameters)
 
 
 def _store(folder: Path, scene: Scene, name: str) -> Any:
