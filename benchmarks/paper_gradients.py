@@ -19,9 +19,20 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
+from figures import keep
 from numpy.typing import NDArray
-from paper_figures import Array, save, show, show_signed
-from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rewrite_table
+from paper_figures import (
+    CONFIGS,
+    PICTURES,
+    ROOT,
+    SHAPES,
+    Array,
+    as_options,
+    ddrecon,
+    save,
+    show,
+    show_signed,
+)
 from path_replay import ALBEDO, DENSITY, Replay, why_not
 
 from ddrecon.io.volumes.table import read_field, write_field
@@ -30,7 +41,6 @@ from ddrecon.scene_file.build import load_scene
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SCRIPT = Path(__file__).name
 CONFIG, CLOUD, PICTURE = CONFIGS / "fig08.yaml", SHAPES / "cloud.npz", PICTURES / "fig08.png"
 PATHS, REPLAY_PATHS = 8192, 512
 LARGER = 2
@@ -234,9 +244,9 @@ def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -
             )
             _draw_comparison(row[1], row[5], image, coarsen(truth), full, "path replay")
     save(figure, PICTURE)
-    for name, top, text in ((SCRIPT, TOP, lines), (f"{SCRIPT} (parts)", TOP_PARTS, parts)):
-        print(top + "".join(text), end="")
-        rewrite_table(name, top + "".join(text))
+    command = "python benchmarks/paper_gradients.py"
+    keep("fig08", command, (TOP + "".join(lines)).splitlines())
+    keep("fig08_parts", f"{command} (parts)", (TOP_PARTS + "".join(parts)).splitlines())
 
 
 def line(
@@ -286,18 +296,6 @@ def shares(
     return rows
 
 
-def main() -> None:
-    """Remakes Fig. 8."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
-    parser.add_argument("--paths", type=int, default=PATHS)
-    parser.add_argument("--replay-paths", type=int, default=REPLAY_PATHS)
-    given = parser.parse_args()
-    remake(given.output, given.paths, given.replay_paths)
-
-
 def _draw_comparison(
     axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str
 ) -> None:
@@ -308,6 +306,18 @@ def _draw_comparison(
     error_axis.set_title(
         f"{ENLARGED} x |error|,\n{title}: {relative_error(image, truth):.2f}", fontsize=8
     )
+
+
+def main() -> None:
+    """Remakes Fig. 8."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
+    parser.add_argument("--paths", type=int, default=PATHS)
+    parser.add_argument("--replay-paths", type=int, default=REPLAY_PATHS)
+    given = parser.parse_args()
+    remake(given.output, given.paths, given.replay_paths)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
-from paper_figures import Array, project, save, show
-from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
+from figures import keep
+from paper_figures import CONFIGS, PICTURES, ROOT, SHAPES, Array, project, save, show
 from path_replay import DENSITY, HEADROOM, Replay, why_not
 
 from ddrecon.io.volumes.table import read_field
@@ -37,7 +37,6 @@ from ddrecon.scene_file.build import load_scene
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SCRIPT = Path(__file__).name
 CONFIG, TARGET = CONFIGS / "fig07.yaml", ROOT / "data" / "paper" / "fig07"
 PATHS, RATE, RAYS = 64, 0.1, 4
 """Paths and rays a pixel of theirs and of ours; learning rate at first."""
@@ -409,8 +408,7 @@ def remake(folder: Path, iterations: int = 40, is_kept: bool = False) -> None:
     ]
     draw(entries, truth, PICTURES / "fig07.png")
     text = table(entries, paces(folder, is_kept), truth)
-    print(text, end="")
-    rewrite_table(SCRIPT, text)
+    keep("fig07", "python benchmarks/paper_path_replay.py", text.splitlines())
 
 
 def main() -> None:

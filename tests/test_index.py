@@ -15,7 +15,7 @@ import ddrecon
 from ddrecon.cameras import Pane
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
-from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transmitted_moments
+from ddrecon.medium.optics import face_resistance, reflectance, refract, transmitted_moments
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values

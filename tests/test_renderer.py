@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import half_empty, make_camera, make_scene, random_values, tensor
 from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays
@@ -270,3 +270,29 @@ def test_derivatives_agree_in_both_modes_and_with_differences(name: str, configu
 def test_the_derivative_by_g_is_that_of_both_modes_at_zero():
     """Where light's direction begins to matter, by forward mode as by reverse mode."""
     assert check("g", {"g": 0.0, **BOTH}).modes_error < 1e-10
+
+
+def test_an_empty_volume_shows_the_background_as_it_is() -> None:
+    """Whatever the camera does: a picture without the medium is such a picture."""
+    scene = make_scene(half_empty(4, 5, 6), ambient=(0.3,))
+    picture = torch.rand(3, *scene.views[0].camera.size, dtype=torch.float64)
+    empty = replace(scene.volume, density=torch.zeros_like(scene.volume.density))
+    response = {"exposure": tensor(1.3, 0.7, 2.0), "offset": tensor(0.1)}
+    view = replace(scene.views[0], background=picture, **response)
+    (shown,) = render(replace(scene, volume=empty, views=[view]))
+    torch.testing.assert_close(shown, picture)
+
+
+def test_a_picture_is_exposure_times_radiance_and_offset_and_what_shows_through() -> None:
+    scene = make_scene(half_empty(4, 5, 6), ambient=(0.3,))
+    view, zero = scene.views[0], tensor(0).view(1, 1, 1)
+
+    def picture(**response: torch.Tensor) -> torch.Tensor:
+        return render(replace(scene, views=[replace(view, **response)]))[0]
+
+    dark, bright = picture(background=zero), picture(background=zero + 1)
+    transmittance = bright - dark
+    assert 0 < float(transmittance.min()) < float(transmittance.max()) <= 1 + 1e-12
+    shown = picture(background=zero + 0.4, exposure=tensor(1.7), offset=tensor(0.05))
+    expected = 1.7 * dark + transmittance * (0.4 - 0.05) + 0.05
+    torch.testing.assert_close(shown, expected, rtol=1e-6, atol=1e-6)

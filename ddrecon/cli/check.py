@@ -25,10 +25,8 @@ from ddrecon.run.job import Told
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
-from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
-from ddrecon.terms import needed_terms
-from ddrecon.turntable import upright_axis
+from ddrecon.terms import find_doubts, needed_terms
 from ddrecon.variables.values import with_values
 
 TOO_WIDE = 8.0
@@ -65,10 +63,10 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
     return supports
 
 
-def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> Told:
+def describe(scene: Scene, supports: Sequence[Support] = ()) -> Told:
     """Tells of `scene` its grid, physics, engine, time and so on, and what can hardly be meant.
 
-    Its parameters are where they start. `up` is `volume.up`.
+    Its parameters are where they start.
     """
     built, scene = scene, with_values(scene, scene.starts)
     grid, train, settings = scene.volume.grid, select_views(scene, is_test=False), scene.optimize
@@ -80,8 +78,7 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> T
     density = settings.parameters.get("density") if settings is not None else None
     is_asked = density is not None and density.support is not None
     with nullcontext() if is_asked else suppress(SceneError):
-        upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
-        support = describe_support(supports, grid, upright)
+        support = describe_support(supports, grid)
         if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
     low, high = (list(corner) for corner in grid.bounds_xyz)

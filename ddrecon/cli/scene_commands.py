@@ -30,16 +30,15 @@ def check(session: Session, source: Path) -> None:
     scene_file = session.read(source)
     from ddrecon.cli.check import describe, supports_of
     from ddrecon.progress import tell
-    from ddrecon.scene_file.frames import each_frame, require_frames
+    from ddrecon.scene_file.build_views import each_frame, require_frames
 
     if scene_file.tree.frames is not None:
         require_frames(scene_file)
     scenes = map(session.build, each_frame(scene_file))
-    up = getattr(scene_file.tree.volume, "up", "y")
     with tell("reading pictures, and looking at what they show", session.is_quiet):
         first = next(scenes)
         supports = supports_of(chain([first], scenes))
-        report, lines = describe(first, supports, up)
+        report, lines = describe(first, supports)
     support = report["support"] or {}
     if (doubt := support.get("doubt")) and "cells" not in support:
         raise scene_file.refused("volume.bounds", doubt)

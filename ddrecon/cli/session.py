@@ -140,7 +140,7 @@ class Session:
         import torch
 
         from ddrecon.scene_file.build import build_scene
-        from ddrecon.scene_file.doubts import find_doubts
+        from ddrecon.terms import find_doubts
 
         dtype = dtype or getattr(torch, self.dtype)
         scene = build_scene(scene_file, dtype=dtype, device=place)

@@ -46,8 +46,7 @@ def reference(
     scene = session.build(scene_file)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import REFERENCE, claim_folder
-    from ddrecon.reference.compare import compare_to_folder, reference_lines
-    from ddrecon.reference.trace import open_tracer
+    from ddrecon.reference.trace import compare_to_folder, open_tracer, reference_lines
     from ddrecon.scene_file.load import referenced_files
 
     views, output = (
@@ -98,8 +97,7 @@ def bench(session: Session, source: Path | None, is_quick: bool, is_hard: bool) 
 def _bench_speed(
     session: Session, load: Callable[[torch.dtype], Scene] | None, is_quick: bool
 ) -> Told:
-    from ddrecon.bench.measure import bench_lines, describe, run_bench
-    from ddrecon.bench.plume import load_pair
+    from ddrecon.bench import bench_lines, load_pair, run_bench
     from ddrecon.errors import MissingExtraError, SceneError
     from ddrecon.reference.trace import open_tracer
 
@@ -111,8 +109,8 @@ def _bench_speed(
         tracer = open_tracer(scene, scene.views, threads=session.threads)
     except (MissingExtraError, SceneError) as error:
         click.echo(f"without path tracing: {error}", err=True)
-    rows = run_bench(scene, double, tracer, is_quick, session.progress)
-    return describe(rows, scene, session.environment()), bench_lines(rows)
+    report = run_bench(scene, double, tracer, is_quick, session.progress)
+    return report | {"environment": session.environment()}, bench_lines(report)
 
 
 @command("SCENE | VOLUME...", "file overwrite up", common="overrides debug")
@@ -136,7 +134,7 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
     kind, suffixes = file.suffix.lower(), (".xml", ".json", *WRITTEN)
     if kind not in suffixes:
         raise UsageError(f"-o {file}: unknown format {kind!r}; known: {', '.join(suffixes)}")
-    from ddrecon.reference.export import export_scene
+    from ddrecon.reference.exchange import export_scene
     from ddrecon.run.run_folder import LENGTHS, fields_to_export
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.experiments import volumes_in
@@ -178,7 +176,7 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
 @command("FILE.xml", "file overwrite", common="debug")
 def import_(session: Session, source: Path, file: Path) -> None:
     """Write a scene file of a Mitsuba 3 scene: a grid volume in a cube, its lights and cameras."""
-    from ddrecon.reference.scene_import import import_scene
+    from ddrecon.reference.exchange import import_scene
 
     written = import_scene(source, file, may_exist=session.overwrite)
     session.show({}, [f"written: {', '.join(map(str, written))}"])

@@ -69,9 +69,8 @@ from ddrecon.run.run_folder import (
 )
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.build_views import remove_pictures
+from ddrecon.scene_file.build_views import Maker, at_frame, remove_pictures, require_frames
 from ddrecon.scene_file.build_volume import build_media
-from ddrecon.scene_file.frames import at_frame, require_frames
 from ddrecon.scene_file.load import (
     SceneFile,
     describe,
@@ -79,7 +78,6 @@ from ddrecon.scene_file.load import (
     read_scene,
     referenced_files,
 )
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.view_schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import EVERY

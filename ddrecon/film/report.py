@@ -16,8 +16,7 @@ from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import FILM
 from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.pictures import srgb
-from ddrecon.report.curve import Plot, draw_curve
-from ddrecon.report.page import write_page
+from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.job import Told

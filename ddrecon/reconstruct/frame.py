@@ -77,11 +77,17 @@ class Frame:
         values = {p.name: p.value for p in self.parameters}
         compared = Comparison(self.level.train.views, self.level.targets)
         unit = self.problem.power or 1.0
-        differentiated = self._differentiate(values, compared)
-        penalties = {p.name: p.penalty() for p in self.parameters}
-        priors = {name: pair for name, pair in penalties.items() if pair is not None}
-        penalty = sum((value for value, _ in priors.values()), differentiated.loss.new_zeros(()))
-        of_images, prior, psnr = compared.read(differentiated, penalty, self.parameters)
+        numbers = None
+        while numbers is None:
+            differentiated = self._differentiate(values, compared)
+            penalties = {p.name: p.penalty() for p in self.parameters}
+            priors = {name: pair for name, pair in penalties.items() if pair is not None}
+            terms = (value for value, _ in priors.values())
+            penalty = sum(terms, differentiated.loss.new_zeros(()))
+            numbers = compared.read(differentiated, penalty, self.parameters)
+            if numbers is None:
+                self.replays.forget(compared, self.memory)
+        of_images, prior, psnr = numbers
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
         bars = {name: bar for name, (_, bar) in priors.items()}

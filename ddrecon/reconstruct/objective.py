@@ -85,17 +85,22 @@ class Comparison:
         objective: Differentiated,
         penalty: Tensor,
         parameters: Sequence[Parameter],
-    ) -> tuple[float, float, float]:
+    ) -> tuple[float, float, float] | None:
         """The loss of images of an iteration, its `penalty`, and the images' mean PSNR [dB].
 
-        All are read at once, with the extremes of the derivatives. Raises NotFiniteError where a
-        loss, or a derivative by one of the `parameters`, is not finite.
+        All are read at once, with the extremes of the derivatives. None where a solve did not end.
+        Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not
+        finite.
         """
         gradients = objective.gradients
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-        groups = [[objective.loss, penalty], extremes, *self.metrics.values()]
+        residuals = [residual.to(penalty) for residual, _ in objective.residuals]
+        groups = [[objective.loss, penalty], residuals, extremes, *self.metrics.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
-        (of_images, prior), ends, *rows = (list(islice(flat, len(group))) for group in groups)
+        (of_images, prior), errors, ends, *rows = (list(islice(flat, len(g))) for g in groups)
+        limits = (limit for _, limit in objective.residuals)
+        if not all(error <= limit for error, limit in zip(errors, limits, strict=True)):
+            return None
         if not all(map(math.isfinite, [of_images, prior, *ends])):
             self.require_finite()
             require_finite(parameters, gradients)

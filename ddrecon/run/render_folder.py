@@ -41,8 +41,13 @@ from ddrecon.run.run_folder import write_volume
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
-from ddrecon.variables.tangents import variation, varied
-from ddrecon.variables.values import component_names, value_of, variable_names
+from ddrecon.variables.values import (
+    component_names,
+    value_of,
+    variable_names,
+    variation,
+    varied,
+)
 
 GRADIENT = ".gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""

@@ -20,8 +20,7 @@ from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.report.curve import Plot, draw_curve
-from ddrecon.report.page import write_page
+from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.quality import Findings, shift_between

@@ -29,7 +29,7 @@ from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.frames import at_frame
+from ddrecon.scene_file.build_views import at_frame
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 Run = Callable[..., Result]

@@ -34,7 +34,7 @@ CUBES = (1.0, 1.0, 1.0)
 
 @pytest.fixture(autouse=True)
 def whatever_is_fastest(same_engine: None) -> None:
-    """What holds of rounds holds with either engine, to rounding (`test_fused_sweep.py`)."""
+    """What holds of rounds holds with either engine, to rounding (`test_fused.py`)."""
     use_engine("auto")
 
 
