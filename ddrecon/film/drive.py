@@ -23,7 +23,7 @@ from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.ranks import own_rank, rank_count
-from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import PREVIOUS, fingerprint, newest_checkpoint
 from ddrecon.run.drive import optimize_in_folder

@@ -10,7 +10,7 @@ from typing import Any
 
 from ddrecon.errors import DataWarning
 from ddrecon.io.files.atomic import refusals, replace_file
-from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.frame import Row
 
 COLUMNS = [field.name for field in fields(Row)]
 

@@ -18,11 +18,11 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
+from ddrecon.reconstruct.gradients import share_pictures
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
-from ddrecon.reconstruct.shares import share_pictures
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
