@@ -20,7 +20,6 @@ from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.numerics.interpolation import resize
-from ddrecon.settings import FLOOR
 
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
@@ -37,19 +36,21 @@ GAP, NOTHING = 1.0, 1e-3
 layers are so small a part: beyond the medium nothing holds it up.
 """
 
+FLOOR = 3.3
+"""Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 
-def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
-    """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
-    least = floor / min(grid.extent)
+
+def smooth(transport_extinction: Tensor, grid: Grid) -> Tensor:
+    """D = 1 / (3 sqrt(kappa_tr^2 + (FLOOR / shortest side of the box)^2))."""
+    least = FLOOR / min(grid.extent)
     return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
 
 
-def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
+def geometric(transport_extinction: Tensor, grid: Grid) -> Tensor:
     """D = 1 / (3 kappa_tr + 4 / distance): collisions and spreading, two resistances in series.
 
-    See docs/theory.md, section 5. `distance` is that to the medium. `floor` is not used: nothing
-    here depends on the size of the box. Below zero, where only finite differences go, D is
-    continued to second order and stays positive.
+    See docs/theory.md, section 5. `distance` is that to the medium. Below zero, where only finite
+    differences go, D is continued to second order and stays positive.
     """
     # D = 1 / (spreading (1 + ratio)), with spreading = 4 / distance
     unit = transport_extinction.new_ones(())
@@ -144,7 +145,7 @@ def _along(line: Tensor, axis: int) -> Tensor:
     return line.view(shape)
 
 
-CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {
+CLOSURES: dict[str, Callable[[Tensor, Grid], Tensor]] = {
     "geometric": geometric,
     "smooth": smooth,
 }
@@ -156,7 +157,6 @@ class Closure:
 
     name: str
     grid: Grid
-    floor: float = FLOOR
 
     def __call__(self, transport_extinction: Tensor) -> Tensor:
-        return CLOSURES[self.name](transport_extinction, self.grid, self.floor)
+        return CLOSURES[self.name](transport_extinction, self.grid)

@@ -80,7 +80,7 @@ template <> struct Format<double> {
 };
 
 // How little before a cell's center a place counts as on it, in units of a line's length
-// (`numerics/third_order.py`).
+// (`numerics/interpolation.py`).
 template <class F> constexpr F NEARLY = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
 
 constexpr INLINE double factorial(int n) {

@@ -18,9 +18,9 @@ from ddrecon.medium.coefficients import Medium, along_colors, mean_width
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.decay import Nodes
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import resize
-from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
 MOST_NUMBERS = 1 << 23

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Cells, Grid
-from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume
-from ddrecon.medium.mixture import remix
+from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume, remix
 from ddrecon.numerics.interpolation import resize
-from ddrecon.numerics.periods import Unrolled
+from ddrecon.numerics.layout import Unrolled
 
 
 def volume_at_level(volume: Volume, grid: Grid, cells: Cells | None = None) -> Volume:

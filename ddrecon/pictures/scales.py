@@ -1,4 +1,4 @@
-"""The scales on which pictures are compared: linear radiance, displayed values, stabilized ones."""
+"""The scales on which pictures are compared, and how alike they are in structure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, conv2d, pad
 
 from ddrecon.pictures.noise import Noise, estimate_noise
 from ddrecon.pictures.srgb import display, display_slope
@@ -14,8 +14,10 @@ from ddrecon.pictures.srgb import display, display_slope
 SIDE = 32
 NODES = SIDE**2 + 1
 """Places between which the stabilized scale is interpolated, close together near black."""
-
-
+RADIUS, DEVIATION = 5, 1.5
+"""The Gaussian window, in pixels: 11 x 11."""
+K1, K2 = 0.01, 0.03
+"""Parts of the peak that keep quotients finite in flat places."""
 LINEAR = "linear radiance"
 COMPARED = {"display": "displayed values (sRGB)", "photon": "radiance in units of its noise"}
 """What losses compare, in words, where that is not linear radiance."""
@@ -85,3 +87,33 @@ def scale_of(loss: str, image: Tensor, noise: Noise | None) -> Scale:
     if loss == "photon":
         return Stabilized(noise=noise or estimate_noise(image, 0.0))
     return Displayed() if loss == "display" else Scale()
+
+
+def structural_similarity(
+    image: Tensor, reference: Tensor, peak: Tensor, seen: Tensor | None = None
+) -> Tensor:
+    """The structural similarity [c, h, w] of two images [c, h, w] whose largest value is `peak`.
+
+    Wang et al. 2004, doi:10.1109/TIP.2003.819861, with their window. At an edge it is cut off, and
+    where `seen` [h, w] is 0.
+    """
+    place = torch.arange(-RADIUS, RADIUS + 1).to(image)
+    window = torch.exp(-0.5 * (place / DEVIATION) ** 2)
+
+    def blur(values: Tensor) -> Tensor:
+        padded = pad(values[:, None], (RADIUS,) * 4)
+        return conv2d(conv2d(padded, window.view(1, 1, -1, 1)), window.view(1, 1, 1, -1))[:, 0]
+
+    seen = torch.ones_like(image[0]) if seen is None else seen
+    weight = blur(seen[None]).clamp(min=torch.finfo(seen.dtype).tiny)
+
+    def mean(values: Tensor) -> Tensor:
+        return blur(values * seen) / weight
+
+    first, second = mean(image), mean(reference)
+    contrast = mean(image * image) - first**2 + mean(reference * reference) - second**2
+    structure = mean(image * reference) - first * second
+    low, high = (K1 * peak) ** 2, (K2 * peak) ** 2
+    return ((2 * first * second + low) * (2 * structure + high)) / (
+        (first**2 + second**2 + low) * (contrast + high)
+    )

@@ -20,7 +20,7 @@ from torch import Tensor
 from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.kernels.graphs import GraphRecorder
-from ddrecon.numerics.reads import without_reads
+from ddrecon.numerics.remember import without_reads
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct.gradients import (
     Differentiated,

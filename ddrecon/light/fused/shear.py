@@ -19,7 +19,7 @@ from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 from ddrecon.light.shear import Shear
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-from ddrecon.numerics.slicing import Slicing
+from ddrecon.numerics.layout import Slicing
 
 GHOSTS = 3
 """Cells beyond the outermost ones that rays look at."""

@@ -2,7 +2,7 @@
 #include "ddrecon/kernels/dual.h"
 #include "ddrecon/kernels/packets.h"
 // The formulas of the view-ray integral for packets: those of `numerics/decay.py`,
-// `numerics/chebyshev.py`, `numerics/angle_table.py`, `light/point_light.py` and
+// `numerics/series.py`, `light/point_light.py` and
 // `medium/phase_peak.py`, whose constants these are.
 
 namespace ddrecon {
