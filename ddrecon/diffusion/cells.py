@@ -30,7 +30,7 @@ def average_cells(medium: Medium) -> Medium:
 def average(field: Tensor) -> Tensor:
     """The mean in each cell of `field`, linear between centers and even beyond the outermost."""
     if is_fused():
-        from ddrecon.diffusion.fused.around import average_fused
+        from ddrecon.diffusion.fused.cells import average_fused
 
         return average_fused(field)
     for axis in AXES:
@@ -64,7 +64,7 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
 def bend(means: Tensor) -> Tensor:
     """The sum of second differences along all axes; at the ends of one it counts as 0."""
     if is_fused():
-        from ddrecon.diffusion.fused.around import bends_fused
+        from ddrecon.diffusion.fused.cells import bends_fused
 
         return bends_fused(means)
     bends = torch.zeros_like(means)

@@ -194,7 +194,7 @@ def cell_gradient(q: Tensor) -> Tensor:
     Half the difference of both neighbors; at the faces of the box, that to the one.
     """
     if is_fused():
-        from ddrecon.diffusion.fused.around import rises_fused
+        from ddrecon.diffusion.fused.cells import rises_fused
 
         return rises_fused(q)
     return torch.stack(
