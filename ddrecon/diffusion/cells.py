@@ -51,7 +51,7 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
         numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
         numbers = for_channels(numbers.T, len(means)).T
         fields = means, apply_around(bend, means, grid), extinction.field
-        (light,) = apply_cell("diffusion/fused/sharp.h", "Sharp", 1, numbers, *fields)
+        (light,) = apply_cell("diffusion/fused/cells.h", "Sharp", 1, numbers, *fields)
         return light
 
     def find() -> Tensor:

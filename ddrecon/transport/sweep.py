@@ -158,7 +158,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         rows = depths, twice, scattering.scale.view(1, -1)
         colors = max(row.shape[1] for row in rows)
         numbers = torch.cat([row.expand(-1, colors) for row in rows])
-        name = "transport/fused/steep.h", "Steep", 3
+        name = "transport/fused/gain.h", "Steep", 3
         return torch.stack(
             apply_cell(*name, numbers, extinction.field, scattering.field, *gradient)
         )

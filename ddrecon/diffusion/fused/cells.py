@@ -1,7 +1,7 @@
 """Functions of cells, of what is around them, and of their faces, by fused kernels.
 
-D of a medium (`closure.h`), linear functions of neighbors (E2.9, `around.h`), and the system of
-E2.7 and the flux of E2.5 (`faces.h`), all with derivatives.
+D of a medium and linear functions of neighbors (E2.9, `cells.h`), the system of E2.7 and the flux
+of E2.5 (`faces.h`), all with derivatives.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def close_medium(medium: Medium) -> Tensor:
     colors = max(map(len, (*fields, *(term.scale for term in terms))))
     scales = torch.stack([term.scale.reshape(-1).expand(colors) for term in terms])
     cell = f"Geometric<{len(terms)}>"
-    (diffusion,) = apply_cell("diffusion/fused/closure.h", cell, 1, scales, *fields)
+    (diffusion,) = apply_cell("diffusion/fused/cells.h", cell, 1, scales, *fields)
     return diffusion
 
 
@@ -62,7 +62,7 @@ def average_fused(field: Tensor) -> Tensor:
 
 def _look_around(name: str, shape: Sequence[int], field: Tensor) -> Tensor:
     z, y, x = field.shape[1:]
-    header, sizes = "diffusion/fused/around.h", {"nz": z, "ny": y, "nx": x}
+    header, sizes = "diffusion/fused/cells.h", {"nz": z, "ny": y, "nx": x}
     function = RowFunction(header, name, (tuple(shape),), x, _LINES, _SIZES, sizes)
     return function.apply(constant([0.0], field)[None].expand(1, len(field)), field)[0]
 
