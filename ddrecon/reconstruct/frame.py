@@ -228,6 +228,7 @@ class Frame:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "total": dict(vars(self.total)),
             "solutions": dict(self.memory.last),
+            "iterations": dict(self.memory.iterations),
             "misfit": self.misfit,
         }
 
@@ -241,6 +242,8 @@ class Frame:
         """Takes up what solves begin from, at the resolution of `state`."""
         for kind, solution in state["solutions"].items():
             self.memory.last[kind] = solution.to(self.problem.scene.volume.density)
+        # By which iterations are recorded on a GPU.
+        self.memory.iterations = dict(state["iterations"])
 
     def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""

@@ -114,7 +114,7 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(
 ) -> None:
     run, failed = Reconstruction(ball_scene), list[str]()
     run.step()
-    candidate, evaluate = run.search.candidate()["density"], Frame.evaluate
+    candidate, evaluate = run.search.candidate["density"], Frame.evaluate
 
     def fail_once(frame: Frame) -> Evaluation:
         if not failed:
