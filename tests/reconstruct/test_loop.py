@@ -134,7 +134,7 @@ def test_a_candidate_that_is_refused_is_logged_and_not_kept(
     run = Reconstruction(ball_scene)
     row, before = run.step(), run.parameters[0].value.detach().clone()
     # A step so long that all is fog.
-    run.search.step *= 1e3
+    run.search._set_out(1e3 * run.search.step)
     refused = run.step()
     assert refused.loss > row.loss and refused.iteration == run.total.iteration == 2
     assert torch.equal(run.parameters[0].value, before)
