@@ -56,7 +56,7 @@ def export(
         raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(suffixes)}")
     from ddrecon.reference.exchange import export_scene
     from ddrecon.run.exported import LENGTHS, fields_to_export
-    from ddrecon.scene_file.transforms import export_transforms
+    from ddrecon.scene_file.camera_files import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
