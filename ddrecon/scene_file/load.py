@@ -265,11 +265,11 @@ def views_of(
         patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
         is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
         names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
-        there = sorted(next(filter(None, names), []), key=in_order)
-        if there != sorted(there, key=lambda name: in_order(name, DECIMAL)):
+        matches = sorted(next(filter(None, names), []), key=in_order)
+        if matches != sorted(matches, key=lambda name: in_order(name, DECIMAL)):
             what = "matches names with fractions or signs, whose order is not plain: count them"
             raise entries["images"].refused(f"{source.images!r} {what} 0, 1, 2, ...")
-        images = [path for name in there if (path := (folder / name).absolute()).is_file()]
+        images = [path for name in matches if (path := (folder / name).absolute()).is_file()]
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
             raise entries["images"].refused(f"{what} {len(cameras)} cameras")
@@ -324,8 +324,8 @@ def ring_cameras(ring: RingSection, up: Triple) -> list[PerspectiveSection]:
     aside, cameras = np.cross(upward, ahead), []
     for index in range(ring.count):
         turn = 2 * math.pi * index / ring.count
-        way = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
-        x, y, z = (np.array(ring.target) + ring.height * upward + way).tolist()
+        outward = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
+        x, y, z = (np.array(ring.target) + ring.height * upward + outward).tolist()
         camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
         cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=ring.up or up))
     return cameras

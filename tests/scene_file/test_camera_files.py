@@ -86,7 +86,7 @@ def angle(focal: float, pixels: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("shared", "own", "focal"),
+    ("shared", "of_frame", "focal"),
     [
         ({"fl_x": 20, "fl_y": 19}, {}, (20, 19)),
         ({"camera_angle_x": angle(20, 8), "camera_angle_y": angle(19, 6)}, {}, (20, 19)),
@@ -100,9 +100,9 @@ def angle(focal: float, pixels: int) -> float:
     ],
 )
 def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
-    views: Any, shared: Any, own: Any, focal: tuple[float, float]
+    views: Any, shared: Any, of_frame: Any, focal: tuple[float, float]
 ) -> None:
-    (view,) = views(frame(**own), **({"w": 8, "h": 6} | shared))
+    (view,) = views(frame(**of_frame), **({"w": 8, "h": 6} | shared))
     (width, _), (focal_x, focal_y) = view.camera.resolution, focal
     assert view.camera.fov == pytest.approx(math.degrees(angle(focal_x, width)), rel=1e-14)
     assert view.camera.pixel_aspect == pytest.approx(focal_x / focal_y, rel=1e-14)
@@ -110,7 +110,7 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
 
 
 @pytest.mark.parametrize(
-    ("shared", "own", "expected"),
+    ("shared", "of_frame", "expected"),
     [
         ({"k1": -0.1, "k2": 0.02}, {"k1": 0.05}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "PINHOLE"}, None),
@@ -121,9 +121,9 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
     ],
 )
 def test_a_lens_is_a_frames_own_before_that_of_its_file(
-    views: Any, shared: Any, own: Any, expected: FisheyeSection | None
+    views: Any, shared: Any, of_frame: Any, expected: FisheyeSection | None
 ) -> None:
-    (view,) = views(frame(**own), **(SIZES | shared))
+    (view,) = views(frame(**of_frame), **(SIZES | shared))
     assert view.camera.distortion == expected
 
 
@@ -139,7 +139,7 @@ def test_a_frame_takes_precedence_over_its_file(views: Any, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "there", "image"),
+    ("name", "existing", "image"),
     [
         ("images\\r_0.png", ["images/r_0.png"], "images/r_0.png"),
         (".\\images\\r_0", [], "images/r_0.png"),
@@ -152,10 +152,10 @@ def test_a_frame_takes_precedence_over_its_file(views: Any, tmp_path: Path) -> N
     ],
 )
 def test_which_picture_a_name_means(
-    views: Any, tmp_path: Path, name: str, there: list[str], image: str
+    views: Any, tmp_path: Path, name: str, existing: list[str], image: str
 ) -> None:
     (tmp_path / "images").mkdir()
-    for file in there:
+    for file in existing:
         (tmp_path / file).touch()
     (view,) = views(frame(name), **NERFSTUDIO)
     assert view.image == tmp_path / image
@@ -403,12 +403,12 @@ def test_points_are_seen_where_the_manual_says(
     assert second.image == tmp_path / "pictures" / "b c.png"
     scene = build_scene(remove_pictures(scene_file, None), dtype=torch.float64)
     camera = scene.views[1].camera
-    given = dict(zip(MODELS[model].split(), CAMERAS[model], strict=True))
+    parameters = dict(zip(MODELS[model].split(), CAMERAS[model], strict=True))
     lens = "fisheye" if model == "OPENCV_FISHEYE" else "opencv"
-    numbers = torch.tensor([given.get(name, 0.0) for name in LENSES[lens]]).double()
+    numbers = torch.tensor([parameters.get(name, 0.0) for name in LENSES[lens]]).double()
     points = torch.from_numpy(np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)))
     rays = points @ torch.from_numpy(rotation(QUATERNION).T) + torch.from_numpy(SHIFT)
-    focal = [given.get(name, given.get("f")) for name in ("fl_x", "fl_y")]
+    focal = [parameters.get(name, parameters.get("f")) for name in ("fl_x", "fl_y")]
     expected = distort(lens, numbers, rays) * torch.tensor(focal) + torch.tensor([4.2, 3.1])
     seen, _ = project(camera, points)
     is_seen = ~seen.isnan().any(1)

@@ -148,8 +148,8 @@ def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
 def test_marks_lead_later_errors_to_the_line(read: Read):
     scene_file = read(SCENE, "volume.g=0.1")
     for key, place in {"lights.1.radiance": "10:31", "views.0.image.never.written": "12:5"}.items():
-        told = str(scene_file.refused(key, "odd"))
-        assert told.endswith(f"scene.yaml:{place}: {key}: odd")
+        line = str(scene_file.refused(key, "odd"))
+        assert line.endswith(f"scene.yaml:{place}: {key}: odd")
     assert str(scene_file.refused("volume.g", "odd")) == "-D volume.g=0.1: volume.g: odd"
 
 
@@ -179,8 +179,8 @@ def test_a_ring_goes_around_its_target_about_the_way_up(up: int, is_own: bool) -
     """From the axis after it, x, y, z and x again, towards the one after that."""
     upright, ahead, aside = up, (up + 1) % 3, (up + 2) % 3
     along = (float(up == 0), float(up == 1), float(up == 2))
-    given = {"up": along} if is_own else {}
-    ring = RingSection(count=10, radius=2, fov=30, target=(1, 2, 3), height=0.5, **given)
+    of_ring = {"up": along} if is_own else {}
+    ring = RingSection(count=10, radius=2, fov=30, target=(1, 2, 3), height=0.5, **of_ring)
     cameras = ring_cameras(ring, (1.0, 2.0, 3.0) if is_own else along)
     offsets = [tuple(map(sub, camera.origin or (), ring.target)) for camera in cameras]
     assert offsets[0][ahead] == 2 and offsets[1][aside] > 0 > offsets[-1][aside]
