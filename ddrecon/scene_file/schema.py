@@ -406,12 +406,6 @@ class SceneTree:
     def violations(self) -> Iterator[Violation]:
         if not self.lights and not self.glows:
             yield "lights", "there is none, and the volume has no emission"
-        for name in self.optimize.parameters if self.optimize else ():
-            medium, last = split_name(name)
-            section = self.media.get(medium.removeprefix("media.").strip("."))
-            has_g = section and isinstance(section.phase, HenyeyGreensteinSection | None)
-            if last == "phase.g" and has_g:
-                yield "optimize", f"parameters.{name} is called {medium}g here"
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:

@@ -94,7 +94,7 @@ optimize.parameters={{}} => optimize.parameters: names no parameter; known: dens
 optimize.loss=l3 => optimize.loss: expected one of l2, l1, huber, relative_l2, display, photon
 optimize.parameters.densty={{}} => parameters.densty: unknown parameter; did you mean 'density'?
 optimize.parameters.media.cloud.g={{field: true}} => it is not a field, so it has none
-optimize.parameters.phase.g={{}} => parameters.phase.g is called g here
+optimize.parameters.phase.g={{}} => parameters.phase.g: the scene has no such number; known: density
 optimize.parameters.density.support=0.1 => density.support: expected one of masks, auto
 optimize.parameters.g.support=auto => g.support: 'auto' is for density alone
 optimize.parameters.density={{min: 2, max: 1}} => density.max: 1 is not above min, 2
