@@ -265,11 +265,11 @@ def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
             kind = "ambient" if light["type"] == "constant" else light["type"]
             numbers = {key: light[key] for key in light if key in LIGHT}
             lights.append({"type": kind} | numbers)
-        own = place / case["case"]
-        own.mkdir()
+        case_folder = place / case["case"]
+        case_folder.mkdir()
         density = folder / "images" / f"{case['volume']}_density.npz"
         camera["type"] = "perspective"
-        path = write_scene(own, density, bounds, medium, lights, camera, case["resolution"])
+        path = write_scene(case_folder, density, bounds, medium, lights, camera, case["resolution"])
         cases.append((case["case"], path, Traced(full, noise)))
     return cases
 
