@@ -261,6 +261,28 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     assert balance_of(scene, memory.last["forward", 0]).energy < 1e-11
 
 
+def test_a_slanted_pair_in_an_even_box_takes_what_it_takes_of_each_ray() -> None:
+    """By the closed form of E8.11 for the depth of each, whichever face it enters by."""
+    travel, taken = tensor(1.0, -0.6, 2.0), []
+    for cells in (6, 12, 24):
+        scene = in_unit_box(torch.ones(3 * [cells]).double(), travel.tolist(), g=-0.7)
+        medium = scale_medium(scene.volume, 3)
+        pair = follow_pair(medium, scene.lights[0])
+        beta = float(backward_fraction(medium)) * 6.0 / 6.5
+        taken.append(4 * math.pi * 6.5 * (1 - beta) * float((pair.along + pair.against).mean()))
+    rate, wanted, way = math.sqrt(1 - beta**2), 0.0, (travel / travel.norm()).abs()
+    place = (torch.arange(200).double() + 0.5) / 200
+    for axis in range(3):
+        across = [place.view(-1, 1) / way[axis - 2], place / way[axis - 1], 1 / way[axis]]
+        depth = 6.5 * torch.stack(torch.broadcast_tensors(*across)).amin(0)
+        turned, passed = beta / (1 + rate), torch.exp(-rate * depth)
+        leaves = (1 - turned**2) * passed + turned * (1 - passed**2)
+        leaves = leaves / (1 - (turned * passed) ** 2)
+        wanted += IRRADIANCE * float(way[axis] * (1 - leaves).mean())
+    off = [abs(power / wanted - 1) for power in taken]
+    assert off[2] < 0.002 and off[2] < off[1] / 3 < off[0] / 9, off
+
+
 @pytest.mark.parametrize("varied", ["g", "sigma_s"])
 def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
     """So are derivatives there: what cells that are not there yet would turn back is known."""
