@@ -17,7 +17,6 @@ from paper_figures import CONFIGS, SHAPES
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 
 COARSER = 4
@@ -67,7 +66,7 @@ def deviation(run: Reconstruction) -> float:
     found = Uncertainty(run, seed=0)
     while found.count < EXPERIMENTS:
         found.step()
-    return Deviations(found).numbers()["g"]["deviation"]
+    return found.numbers()["g"]["deviation"]
 
 
 def main() -> None:

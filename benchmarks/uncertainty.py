@@ -28,8 +28,7 @@ from ddrecon.reconstruct.levels import resample, scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.deviations import EMPTY, Deviations, mean_around
-from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty.experiments import EMPTY, Uncertainty, mean_around
 
 ROOT = Path(__file__).parents[1]
 Known = tuple[Scene, Tensor]
@@ -90,12 +89,12 @@ def finish(scene: Scene) -> Reconstruction:
     return run
 
 
-def experiment(run: Reconstruction, experiments: int) -> Deviations:
-    """The deviations of `run` by so many experiments."""
+def experiment(run: Reconstruction, experiments: int) -> Uncertainty:
+    """So many `experiments` about `run`, made."""
     found = Uncertainty(run, seed=0)
     while found.count < experiments:
         found.step()
-    return Deviations(found)
+    return found
 
 
 def judge(known: Known, experiments: int) -> dict[str, Any]:
@@ -107,7 +106,7 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
     scene, truth = known
     run = finish(scene)
     deviations = experiment(run, experiments)
-    field, truth = deviations.fields["density"], resample(truth, run.level.train.volume.grid)
+    field, truth = deviations.fields()["density"], resample(truth, run.level.train.volume.grid)
     smoke, error = truth > EMPTY * truth.max(), (field.value - truth).abs()
     row: dict[str, Any] = {"cells": int(smoke.sum())}
     sizes = (error / field.deviation)[smoke]

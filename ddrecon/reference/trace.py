@@ -286,7 +286,7 @@ def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:
     return [*written, beside]
 
 
-def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
+def reference_lines(report: dict[str, Any]) -> list[str]:
     """How far ours is from theirs, and how long both took, as `reference` prints it."""
     lines = []
     for name, view in report["views"].items():
@@ -300,4 +300,4 @@ def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
         times = ", ".join(f"{who} {seconds:.2f} s" for who, seconds in view["seconds"].items())
         lines.append(f"{name}: {', '.join(notes)} ({times})")
     samples, mitsuba = report["settings"]["samples_per_pixel"], report["environment"]["mitsuba"]
-    return [*lines, f"{samples} paths a pixel, Mitsuba {mitsuba}", f"written to {folder}"]
+    return [*lines, f"{samples} paths a pixel, Mitsuba {mitsuba}"]

@@ -79,7 +79,7 @@ def test_a_command_is_understood(line: str) -> None:
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = main.get_command(click.Context(main), name)
     assert command is not None
-    assert (ROOT / command.make_context(name, arguments).params["scene"]).is_file()
+    assert (ROOT / command.make_context(name, arguments).params["source"]).is_file()
 
 
 @pytest.mark.parametrize("text", scenes())

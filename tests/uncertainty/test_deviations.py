@@ -17,8 +17,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.deviations import RATIO, Deviations, Field, mean_around
-from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty.experiments import RATIO, Field, Uncertainty, mean_around
 
 SHAPE = (12, 14, 10)
 GRID = Grid(SHAPE, (0.0, 0.0, 0.0), (1.2, 1.4, 1.0))
@@ -111,7 +110,7 @@ def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(
     found.step()
     torch.testing.assert_close(found.truth["density"], (value.clamp(min=0) - 0.2).clamp(min=0))
     assert float(found.truth["g"]) == 0.3
-    numbers = Deviations(found).numbers()
+    numbers = found.numbers()
     assert numbers["g"] == {"value": 0.3, "deviation": pytest.approx(RATIO * 3 * 0.2)}
     # The mass is the integral over the box, and errs by all cells together.
     mass, volume = numbers["mass of density"], 1.2 * 1.4 * 1.0
