@@ -128,6 +128,14 @@ def test_a_white_furnace_over_a_white_ground_is_in_balance() -> None:
     assert abs(record["defect_percent"]) < 1e-7
 
 
+def test_a_ground_in_the_sun_lights_a_box_from_below_and_half_of_its_sides() -> None:
+    scene = lit_by(DOWN, torch.zeros(4, 5, 6, dtype=torch.float64))
+    record = find_balance(replace(scene, ground=Ground(tensor(0.4), Plane(-0.7, 1))))
+    area = 1.0 * 0.9 + 1.2 * (1.0 + 0.9)
+    expected = [0.4 * area * irradiance for irradiance in (3.0, 2.0, 1.0)]
+    assert record["enters"]["ground"] == pytest.approx(expected, rel=0.01)
+
+
 def test_a_ground_sends_back_its_part_of_a_pencil() -> None:
     """The box stands on it: what it reflects enters, as well as 24 directions say."""
     scene = lit_by(PENCIL, torch.zeros(10, 12, 10, dtype=torch.float64))
