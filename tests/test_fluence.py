@@ -133,7 +133,7 @@ def test_a_ground_in_the_sun_lights_a_box_from_below_and_half_of_its_sides() -> 
     record = find_balance(replace(scene, ground=Ground(tensor(0.4), Plane(-0.7, 1))))
     area = 1.0 * 0.9 + 1.2 * (1.0 + 0.9)
     expected = [0.4 * area * irradiance for irradiance in (3.0, 2.0, 1.0)]
-    assert record["enters"]["ground"] == pytest.approx(expected, rel=0.01)
+    assert record["enters"]["ground"] == pytest.approx(expected, rel=0.004)
 
 
 def test_a_ground_sends_back_its_part_of_a_pencil() -> None:
