@@ -179,7 +179,7 @@ def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
 
 
 def test_a_glowing_layer_lights_the_ground_below_it():
-    """By 2 pi j times its height of 1; the ground shows half of that over pi, to a few directions."""
+    """By 2 pi j times its height of 1; the ground shows half of that over pi."""
     thin = {"sigma_a": (1e-6,), "sigma_s": (0.0,), "directional": None, "has_ground": True}
     scene = repeated(even(4, 5, 3), emission=tensor(1.0), **thin)
     ground = render(scene) - render(replace(scene, ground=None))
