@@ -37,7 +37,7 @@ from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.progress import Progress, say
+from ddrecon.progress import say
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction
@@ -104,7 +104,6 @@ class Film:
     build: Callable[[SceneFile], Scene]
     environment: dict[str, Any] = field(default_factory=dict)
     preview_every: int | None = None
-    is_quiet: bool = True
     shared: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -144,8 +143,8 @@ class Film:
 
         The others wait, and say so, but for those that are to begin anew.
         """
-        tell = partial(say, is_quiet=self.is_quiet) if resume else None
-        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=tell)
+        waiting = say if resume else None
+        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=waiting)
 
     def scene_of(self, number: int) -> SceneFile:
         """The scene of the frame `number`, with what is shared fixed.
@@ -224,7 +223,7 @@ class Calibration(Iterations):
     def begin(self, folder: Folder, is_resumed: bool) -> None:
         """Nothing is to be made, nor to go."""
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes the volumes of these frames and what they share; its checkpoints go."""
         film, together = self.film, self.run
         scene, values = together.current_scene(), dict[str, Any]()
@@ -331,7 +330,7 @@ def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
             job = Calibration(film, spread_out(film.frames.numbers, count))
             if job.run.shared:
                 is_resumed = has_checkpoint(film.path / CHECKPOINTS)
-                work(job, folder, is_resumed=is_resumed, is_quiet=film.is_quiet)
+                work(job, folder, is_resumed)
         film.shared = read_shared(shared) if shared.is_file() else {}
     failures = list[DdreconError]()
     for number in numbers:
@@ -354,9 +353,9 @@ def _drive_frame(film: Film, number: int) -> None:
         with claim_folder(path, RUN, overwrite=True) as folder:
             is_resumed = has_checkpoint(path / CHECKPOINTS)
             scene_file = read_scene(path / SCENE) if is_resumed else film.scene_of(number)
-            scene, options = film.build(scene_file), (film.preview_every, film.is_quiet)
-            job = Run(scene, scene_file, film.environment, *options, f"frame {number}")
-            work(job, folder, is_resumed=is_resumed, is_quiet=film.is_quiet)
+            scene, title = film.build(scene_file), f"frame {number}"
+            job = Run(scene, scene_file, film.environment, film.preview_every, title)
+            work(job, folder, is_resumed)
             (path / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(path, VELOCITY).is_file():
         film.write_velocity(number)

@@ -24,7 +24,7 @@ from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
 from ddrecon.pictures.scales import COMPARED, LINEAR
-from ddrecon.progress import Progress
+from ddrecon.progress import show_progress
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes, target_of
@@ -75,8 +75,8 @@ class Findings:
         return [view for view in self.scene.views if view.image is not None]
 
 
-def find_results(run: Reconstruction, progress: Progress | None = None) -> Findings:
-    """The current result of `run`, rendered; with a `progress`, held-out views are registered."""
+def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
+    """The current result of `run`, rendered; if it `is_last`, held-out views are registered."""
     scene = run.current_scene()
     shown = [view for view in scene.views if view.image is not None]
     targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
@@ -97,7 +97,7 @@ def find_results(run: Reconstruction, progress: Progress | None = None) -> Findi
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
         held_out = [view for view in shown if view.is_test]
-        for view in progress(held_out, "register") if progress and held_out else ():
+        for view in show_progress(held_out, "register") if is_last and held_out else ():
             target = targets[view.name]
             registered = register(light_field, scene, view, target, response_sizes(run.parameters))
             quality[view.name]["registered"] = registered

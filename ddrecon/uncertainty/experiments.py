@@ -25,7 +25,6 @@ from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
-from ddrecon.progress import Progress
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -188,7 +187,7 @@ class Uncertainty(Job):
                 numbers[name] = _with_deviation(value, torch.cat(errors))
         return numbers
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes deviations, as volumes and as a page, and tells `uncertainty.json`."""
         fields, numbers, path = self.fields(), self.numbers(), self.path
         (path / "volumes").mkdir(exist_ok=True)
