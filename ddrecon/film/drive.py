@@ -51,7 +51,7 @@ from ddrecon.run.job import (
     work,
 )
 from ddrecon.run.report import list_numbers
-from ddrecon.run.result import RESULT, plain, poses_of, put_values
+from ddrecon.run.result import RESULT, poses_of, put_values
 from ddrecon.run.run_folder import (
     LENGTHS,
     LOG,
@@ -62,9 +62,9 @@ from ddrecon.run.run_folder import (
     field_key,
     fields_to_export,
     read_log,
+    store_value,
     volume_file,
     write_scene,
-    write_values,
     write_volume,
 )
 from ddrecon.scene import Scene
@@ -226,19 +226,14 @@ class Calibration(Iterations):
     def finish(self) -> Told:
         """Writes the volumes of these frames and what they share; its checkpoints go."""
         film, together = self.film, self.run
-        scene, values = together.current_scene(), dict[str, Any]()
+        scene, names = together.current_scene(), [p.name for p in together.shared]
         for number, frame in zip(self.numbers, together.frames, strict=True):
             for p in frame.parameters:
                 if p.is_field:
                     grid = frame.problem.scene.volume.grid
                     write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
-        poses = poses_of(scene, [p.name for p in together.shared])
-        for p in together.shared:
-            value = p.value.detach()
-            values[p.name] = poses.get(p.name) or plain(value)
-            if value.ndim >= 3:
-                stem, grid = film.path / f"shared.{p.name}", scene.volume.grid
-                values[p.name] = {"file": write_values(stem, p.name, value, grid, is_map=True)}
+        values = {name: store_value(film.path, scene, name) for name in names}
+        values |= poses_of(scene, names)
         numbers = list_numbers(together.shared, together.problem.scene, scene)
         texts = {name: text for name, _, text in numbers}
         content = {"frames": self.numbers, "values": values, "texts": texts}
@@ -437,8 +432,8 @@ def read_shared(path: Path) -> dict[str, Any]:
         raise FormatError(path, "has no 'values'; expected the shared.json of a film")
     values = content["values"]
     for name, value in values.items():
-        if isinstance(value, dict) and "file" in value:
-            values[name] = str((path.parent / value["file"]).absolute())
+        if isinstance(value, str):
+            values[name] = str((path.parent / value).absolute())
     return content
 
 

@@ -168,7 +168,7 @@ class Run(Iterations):
         scene, support = findings.scene, run.problem.support
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
-        values = {name: _store(path, scene, name) for name in stored}
+        values = {name: store_value(path, scene, name) for name in stored}
         dump_scene(describe_result(self.scene_file, scene, values), path / RESULT)
         write_json(path / "parameters.json", _list_parameters(path, scene, values))
         write_previews(path, findings, "")
@@ -293,11 +293,11 @@ def _list_parameters(folder: Path, scene: Scene, stored: Mapping[str, Any]) -> d
         if value.ndim < 3:
             parameters[name] = value.tolist()
         elif not kind_of(name).is_cellwise:
-            parameters[name] = stored.get(name) or _store(folder, scene, name)
+            parameters[name] = stored.get(name) or store_value(folder, scene, name)
     return parameters | poses_of(scene, parameters)
 
 
-def _store(folder: Path, scene: Scene, name: str) -> Any:
+def store_value(folder: Path, scene: Scene, name: str) -> Any:
     """The value of a variable as plain numbers, or where its file is, which is written here."""
     value = value_of(scene, name)
     if value.ndim < 3:
