@@ -274,12 +274,9 @@ def _render_in_turns(
             images = _images(light_field, scene, scene.view(turn[rank].name), names)
         seconds = perf_counter() - start
         for place, view in enumerate(turn):
-            if ranks > 1:
-                nothing = view.camera.pose.new_zeros(3, *view.camera.size)
-                contributions = [images[name] if place == rank else nothing for name in names]
-                yield view, dict(zip(names, sum_over_ranks(contributions), strict=True)), seconds
-            else:
-                yield view, images, seconds
+            nothing = view.camera.pose.new_zeros(3, *view.camera.size)
+            shares = [images[name] if place == rank else nothing for name in names]
+            yield view, dict(zip(names, sum_over_ranks(shares), strict=True)), seconds
 
 
 def _images(
