@@ -18,7 +18,7 @@ _HOMES = {
     "optimize": "reconstruct.loop",
     "show": "report.volumes",
     "optimize_sequence": "film.drive",
-    "Result": "reconstruct.log",
+    "Result": "reconstruct.frame",
     "Scene": "scene",
     "use_engine": "engine",
     "DdreconError": "errors",
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ddrecon.layer import VolumeRenderer as VolumeRenderer
     from ddrecon.layer import fluence as fluence
     from ddrecon.layer import render as render
-    from ddrecon.reconstruct.log import Result as Result
+    from ddrecon.reconstruct.frame import Result as Result
     from ddrecon.reconstruct.loop import optimize as optimize
     from ddrecon.report.volumes import show as show
     from ddrecon.scene import Scene as Scene

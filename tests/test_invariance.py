@@ -187,12 +187,9 @@ def scene_in(density: Tensor, empty: tuple[int, int, int], is_layer: bool, **kin
     return replace(scene, ground=Ground(tensor(ground), Plane(-0.9, 0)))
 
 
-CASES = [
-    (is_layer, light, albedo)
-    for is_layer in (True, False)
-    for light, albedo in [("sun", None), *((light, 0.8) for light in LIGHTS)]
-    if not (is_layer and light == "lamp")
-]
+CASES = [(True, "sun", None), (False, "sun", None)]
+CASES += [(light in ("sun", "sky"), light, 0.8) for light in LIGHTS]
+CASES += [(False, "sky", 0.8), (True, "map", 0.8)]
 
 
 @pytest.mark.parametrize(("is_layer", "light", "albedo"), CASES)

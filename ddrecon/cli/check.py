@@ -12,7 +12,7 @@ from ddrecon.engine import current_engine
 from ddrecon.errors import DdreconError, SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes
-from ddrecon.reconstruct.pace import time_iteration
+from ddrecon.reconstruct.loop import time_iteration
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import (
     Support,

@@ -39,7 +39,7 @@ from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.progress import say
 from ddrecon.ranks import own_rank, rank_count
-from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.job import (
     CHECKPOINTS,

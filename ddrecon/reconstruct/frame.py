@@ -15,7 +15,6 @@ from ddrecon.errors import SolveError
 from ddrecon.pictures.noise import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
-from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.metric import find_diagonals
 from ddrecon.reconstruct.numbers import Point
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
@@ -26,6 +25,42 @@ from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
+
+
+@dataclass(frozen=True)
+class Row:
+    """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
+
+    `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
+    `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
+    views are None where none was rendered, and SSIMs where they were not looked at.
+    """
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr: float
+    test_psnr: float | None
+    forward_iterations: int
+    adjoint_iterations: int
+    cells: int
+    data_loss: float
+    penalty: float
+    ssim: float | None = None
+    test_ssim: float | None = None
+
+
+NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
+"""The sum of no rows."""
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
+
+    scene: Scene
+    rows: list[Row]
+
 
 OF_CANDIDATE = ("loss", "data_loss", "penalty", "psnr", "ssim")
 """What a row says of a candidate, which may be refused."""

@@ -19,11 +19,10 @@ from ddrecon.errors import RanksError, SolveError
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
-from ddrecon.reconstruct.frame import Evaluation, Frame
-from ddrecon.reconstruct.log import Result, Row
+from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
 from ddrecon.reconstruct.metric import FieldMetric
 from ddrecon.reconstruct.numbers import Numbers
+from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
 from ddrecon.reconstruct.search import Inverse, Objective, Search, Space, Values
@@ -194,6 +193,7 @@ class Reconstruction:
         loss, values = self.rival
         if is_over and self.search.objective.loss > tuning.BETTER * loss:
             self._put(values)
+            self.search.pairs = []
         self.rival = math.inf, {}
         if self.schedule.stage.is_trial:
             self.rival = self.search.objective.loss, self.search.values
@@ -202,14 +202,20 @@ class Reconstruction:
                 for key, value in self.search.values.items()
             }
             self._put(self._project(denser))
+            self.search.pairs = []
 
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
-        # How long the metric is hardly changes with resolution.
         self.diagonals = {}
-        self.search = Search(self.space, scales=self.search.scales, weight=self.search.weight)
+        # How the objective bends, and how long the metric is, hardly changes with resolution.
+        pairs = [
+            (self._carry(move), self._carry(of_loss, True), self._carry(of_prior, True))
+            for move, of_loss, of_prior in self.search.pairs
+        ]
+        scales, weight = self.search.scales, self.search.weight
+        self.search = Search(self.space, scales=scales, weight=weight, pairs=pairs)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
     def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
@@ -308,7 +314,36 @@ class Reconstruction:
         for key, p in self.blocks.items():
             p.value = values[key].detach().requires_grad_()
 
+    def _carry(self, vector: Values, is_slope: bool = False) -> Values:
+        """Moves, or derivatives, carried to the resolution of the parameters."""
+        return {key: self.blocks[key].carry(entry, is_slope) for key, entry in vector.items()}
+
     def _key(self, frame: Frame, p: Parameter) -> str:
         """The search's name of a parameter of `frame`: fields are each frame's own."""
         is_shared = len(self.frames) == 1 or not p.is_field
         return p.name if is_shared else f"frame {self.frames.index(frame)} {p.name}"
+
+
+BEGUN = 2
+"""Iterations after which there is a medium, and kernels are compiled."""
+
+
+def time_iteration(scene: Scene) -> float:
+    """About how many seconds an iteration at the full resolution of `scene` takes.
+
+    Cells and samples of view rays alike grow with the cells, so the time of an iteration is a line
+    through those at the two coarsest levels of resolution. Raises DdreconError as a run does.
+    """
+    run, points = Reconstruction(scene), list[tuple[int, float]]()
+    for _ in range(BEGUN):
+        run.step()
+    frame, levels = run.frames[0], len(run.problem.factors)
+    for level in range(levels)[:2]:
+        frame.enter(level)
+        frame.evaluate()  # what is prepared once
+        start = perf_counter()
+        frame.evaluate()
+        points.append((frame.level.train.volume.grid.cells, perf_counter() - start))
+    (fewer, less), (more, longer) = points[0], points[-1]
+    rate = max(longer - less, 0.0) / (more - fewer) if more > fewer else 0.0
+    return longer + rate * (scene.volume.grid.cells - more)

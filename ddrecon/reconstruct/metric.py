@@ -19,8 +19,7 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import face_stiffness
+from ddrecon.reconstruct.parameters import Parameter, face_stiffness
 from ddrecon.scene import Scene, View
 
 

@@ -26,8 +26,8 @@ from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import own_views
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, kind_of
 from ddrecon.variables.values import with_values

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
 from ddrecon.pictures import srgb
-from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.page import Plot, draw_curve, write_page

@@ -23,7 +23,7 @@ from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import write_field
 from ddrecon.progress import say, tell
-from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.report.pictures import comparison, slices

@@ -25,11 +25,11 @@ from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
+from ddrecon.reconstruct.gradients import share_pictures
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
-from ddrecon.reconstruct.shares import share_pictures
 from ddrecon.report.page import write_page
 from ddrecon.run.job import Job, Told
 from ddrecon.run.report import describe_fields

@@ -102,9 +102,9 @@ def value_of(scene: Scene, name: str) -> Tensor:
     [1] or [3].
     """
     known = find_readers(scene)
-    if (stored := _stored_name(scene.volume, name)) not in known:
+    if name not in known:
         raise _unknown(scene, name)
-    return known[stored]()
+    return known[name]()
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
@@ -118,15 +118,14 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     """
     named, known = dict[str, Tensor](), find_readers(scene)
     for name, value in values.items():
-        stored = _stored_name(scene.volume, name)
-        if stored not in known:
+        if name not in known:
             raise _unknown(scene, name)
-        owner, last = split_name(stored)
+        owner, last = split_name(name)
         if last == "density" and isinstance(value, Tensor) and value.ndim == 0:
             value = value.expand(scene.volume.grid.shape)
-        like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else stored
-        require_form(stored, value, known[like](), scene.volume.density, scene.volume.grid.shape)
-        named[stored] = value
+        like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else name
+        require_form(name, value, known[like](), scene.volume.density, scene.volume.grid.shape)
+        named[name] = value
     of_volume = {name: value for name, value in named.items() if is_of_volume(name)}
     lights: list[Light] = [
         replace(light, **_within(f"lights.{index}.", named))  # type: ignore[arg-type]
@@ -161,7 +160,7 @@ def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
     """Those that the variable `name` of `scene` may have; raises as `value_of`."""
     is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
     shape = () if is_pair else tuple(value_of(scene, name).shape)
-    return shapes_in_place(_stored_name(scene.volume, name), shape, scene.volume.grid.shape)
+    return shapes_in_place(name, shape, scene.volume.grid.shape)
 
 
 def shapes_in_place(
@@ -253,15 +252,6 @@ def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         value if value.ndim == axes else value.view(-1, 1, 1, 1) for value in (first, second)
     )
     return first, second
-
-
-def _stored_name(volume: Volume, name: str) -> str:
-    """`name`, or `g` for `phase.g` where both are the same."""
-    owner, last = split_name(name)
-    if last != f"{PHASE}g":
-        return name
-    medium = (volume.media or {}).get(owner.removeprefix("media.").strip("."), volume)
-    return f"{owner}g" if isinstance(medium.phase, HenyeyGreenstein) else name
 
 
 def _albedo_of(volume: Volume) -> Tensor:

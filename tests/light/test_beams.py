@@ -9,7 +9,6 @@ import pytest
 import torch
 from media import (
     box_grid,
-    convergence_order,
     half_empty,
     make_camera,
     make_scene,
@@ -42,7 +41,6 @@ from ddrecon.settings import RenderSettings
 from ddrecon.validate.hard import balance_of
 
 SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
-DIRECTIONS = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), *SLANTED, (1.0, 1.0, 1.0)]
 
 
 def unit(direction: tuple[float, ...]) -> Tensor:
@@ -143,32 +141,6 @@ def mass_to_centers(field: Tensor, grid: Grid, direction: Tensor) -> Tensor:
     return entered[0] + 0.5 * step * field
 
 
-WIDTH = 0.09
-
-
-def blob(grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """A Gaussian at cell centers, and its integral along `direction` from infinity to there."""
-    middle = [(low + high) / 2 for low, high in zip(grid.lower, grid.upper, strict=True)]
-    places = torch.broadcast_tensors(*grid.centers(direction))
-    offset = torch.stack(places, -1) - torch.tensor(middle, dtype=torch.float64)
-    along = offset @ direction
-    across = (offset**2).sum(-1) - along**2
-    gaussian, unit = torch.exp(-(offset**2).sum(-1) / (2 * WIDTH**2)), WIDTH * math.sqrt(2)
-    passed = math.sqrt(math.pi) / 2 * unit * (1 + torch.erf(along / unit))
-    return gaussian, torch.exp(-across / unit**2) * passed
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
-def test_the_depth_of_a_smooth_blob_converges_at_second_order(direction: tuple[float, ...]):
-    errors, counts = [], [4, 6, 9, 12]
-    for count in counts:
-        grid = box_grid((4 * count, 5 * count, 3 * count))
-        field, integral = blob(grid, unit(direction))
-        error = mass_to_centers(field, grid, unit(direction)) - integral
-        errors.append(float(error.square().mean().sqrt()))
-    assert convergence_order([1 / count for count in counts], errors) >= 1.8, errors
-
-
 @pytest.mark.parametrize("direction", [*SLANTED, (0.9, 0.2, 0.02), (1.0, 1.0, 1.0)], ids=str)
 def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[float, ...]):
     """Up to the faces: where the light of two cells around comes by the same one, it is exact."""
@@ -189,21 +161,6 @@ def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[flo
     found = mass_to_centers(torch.full(grid.shape, 3.0, dtype=torch.float64), grid, travel)
     assert int(same.sum()) > 100
     torch.testing.assert_close(found[same], 3 * way[same], rtol=1e-13, atol=0)
-
-
-def test_what_comes_through_a_side_is_received():
-    """Under a sun at 60 degrees, by columns of a layer that cells cross sideways: order 2."""
-    errors, depths = [], [1.0, 0.5, 0.25]
-    for depth in depths:
-        layers, columns = round(4 / depth), round(12 / depth)
-        grid = Grid((layers, 1, columns), (0, 0, 0), (4.0, 1e6, 12.0))
-        field = torch.ones(1, *grid.shape, dtype=torch.float64)
-        entered, step = sum_mass_to_cells(field, grid, unit((0.5, 0.0, 0.75**0.5)))
-        received = torch.exp(-entered) * (1 - torch.exp(-step)) / step
-        taken = 2 * depth * received[0, :, 0, -columns // 4 :].mean(1).sum()
-        errors.append(abs(float(taken) / (1 - math.exp(-8)) - 1))
-    assert errors[1] < 0.02, errors
-    assert convergence_order(depths, errors) >= 1.8, errors
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.4142, -0.5, 0.6)], ids=str)
@@ -390,19 +347,6 @@ def unscattered_ambient(medium: Medium, radiance: Tensor) -> Tensor:
 
 def received(grid: Grid, density: Tensor, lights: list, **medium) -> Tensor:
     return receive_light(medium_in(grid, density, **medium), lights, degree=1).source
-
-
-@pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])
-def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float):
-    """What a column of any thickness absorbs and scatters the beam loses: E (1 - exp(-depth))."""
-    grid = Grid((6, 1, 2), (0, 0, 0), (1.5, 1, 1))
-    density = depth_per_cell / grid.spacing[0] * random_values(*grid.shape)
-    light = DirectionalLight(tensor(0, 0, -2), tensor(2, 2))
-    source = received(grid, density, [light], g=0.0, sigma=([0.5, 0.2], [0.5, 1.8]))
-    kappa = torch.tensor([1.0, 2.0], dtype=torch.float64).view(2, 1, 1, 1) * density
-    lost = (4 * math.pi * kappa * source[0]).sum(1) * grid.spacing[0]
-    depth = kappa.sum(1) * grid.spacing[0]
-    torch.testing.assert_close(lost, 2.0 * -torch.expm1(-depth), rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.4, -0.4])

@@ -10,17 +10,13 @@ from media import (
     box_grid,
     make_camera,
     make_scene,
-    march_rays,
     random_values,
 )
 from scenes import VIEWS
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, cast_rays
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lighting import send, solve_light
-from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
 from ddrecon.march.samplers import choose_sampling
@@ -85,22 +81,6 @@ def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
         )
         between = interpolate(corners.T.unflatten(1, lattice.shape), lattice.places)
         torch.testing.assert_close(between.T, own, rtol=0, atol=1e-12)
-
-
-@each_camera
-def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
-    """Pixels of the lattice's own rays are what marching those rays gives."""
-    scene = scene_of(view)
-    lattice = lattice_of(scene)[0]
-    outgoing = send(solve_light(scene, SolveMemory()), lattice.rays)
-    hit = cross_box(scene.volume.grid, lattice.rays).hit
-    places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
-    own_places = replace(lattice, places=places)
-    monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated = march_rays(outgoing, lattice.rays, INTERPOLATED)
-    own = march_rays(outgoing, lattice.rays, OWN)
-    for one, other in zip(interpolated, own, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 
 
 @each_camera

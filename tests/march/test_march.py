@@ -43,7 +43,6 @@ from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.variables.values import value_of, with_values
 
 each_camera = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
@@ -136,34 +135,6 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
 
-THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
-
-
-def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
-    """A homogeneous slab seen straight on, along z, by a parallel camera, under parallel light."""
-    grid = Grid((cells, 2, 2), (-THICKNESS / 2, -9.0, -9.0), (THICKNESS / 2, 9.0, 9.0))
-    camera = make_camera(eye=(0.0, 0.0, 5.0), size=(1, 1), half_width=0.1, is_perspective=False)
-    density = torch.ones(grid.shape, dtype=torch.float64)
-    medium = {"sigma_a": (SIGMA_A,), "sigma_s": (SIGMA_S,), "g": g, "model": "none"}
-    return make_scene(density, grid=grid, travel=travel, camera=camera, **medium)
-
-
-@pytest.mark.parametrize(("g", "is_behind"), [(0.0, False), (-0.6, True)])
-@pytest.mark.parametrize("steps", [1, 3])
-def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool, steps: int):
-    """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L)."""
-    kappa, cosine = SIGMA_A + SIGMA_S, -1.0 if is_behind else 1.0
-    phase = (1 - g**2) / (1 + g**2 - 2 * g * cosine) ** 1.5
-    decayed = THICKNESS * math.exp(-kappa * THICKNESS)
-    if is_behind:
-        decayed = -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
-    expected = SIGMA_S * phase * 3.0 / (4 * math.pi) * decayed
-    settings = RenderSettings(steps_per_voxel=steps)
-    for cells in (2, 8):
-        image = render(replace(slab(cells, g, (0.0, 0.0, cosine)), render=settings))
-        assert float(image.mean()) == pytest.approx(expected, rel=1e-12)
-
-
 def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
     """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
     absorbing = {"sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
@@ -188,12 +159,6 @@ LIGHTS: dict[str, list[Light]] = {
     "a point inside": [PointLight(tensor(0.1, 0.2, -0.1), tensor(2, 1, 3))],
     "a beam and ambient light": [DirectionalLight(*BEAM), AmbientLight(tensor(0.5, 0.4, 0.3))],
     "a sky": [EnvironmentLight(random_values(3, 8, 16), tensor(20)[0], tensor(1)[0], 8)],
-}
-NUMBERS: dict[type, tuple[str, ...]] = {
-    DirectionalLight: ("direction", "irradiance"),
-    PointLight: ("position", "intensity"),
-    AmbientLight: ("radiance",),
-    EnvironmentLight: ("radiance", "rotation"),
 }
 
 
@@ -360,32 +325,6 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
         fast, plain = march_fast(outgoing, rays, 4)[0], march_twin(outgoing, rays, 16)[0]
         errors.append(float((fast - plain).norm() / plain.norm()))
     assert errors[-1] < 2e-3 and convergence_order([1 / 8, 1 / 16, 1 / 32], errors) > 1.5, errors
-
-
-VIEW_OF = dict.fromkeys(LIGHTS, "oblique") | {"two beams": "inside", "a point inside": "inside"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "view"), VIEW_OF.items())
-@pytest.mark.usefixtures("same_fields")
-def test_derivatives_agree_in_the_limit(name: str, view: str):
-    """By medium, lights and camera; its derivative is of first order: density has kinks."""
-    lights = LIGHTS[name]
-    scene = lit_scene(lights, VIEWS[view])
-    names = ["density", "g", "sigma_s", "views.view.camera"]
-    for index, light in enumerate(lights):
-        names += [f"lights.{index}.{number}" for number in NUMBERS[type(light)]]
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    outgoing, rays = emit(with_values(scene, leaves))
-    weights = random_values(2, 3, len(rays.direction), seed=5)
-
-    def gradients(marcher: Callable[..., Any], steps: int) -> list[Tensor]:
-        loss = (weights * torch.stack(marcher(outgoing, rays, steps))).sum()
-        return list(torch.autograd.grad(loss, list(leaves.values()), retain_graph=True))
-
-    for name, errors in zip(names, differences(gradients), strict=True):
-        is_camera = name == "views.view.camera"
-        assert_order(errors, *((0.01, 0.7) if is_camera else (1e-3, 1.4)))
 
 
 def test_rounding_does_not_choose_between_axes() -> None:

@@ -1,13 +1,11 @@
 """Functions of directions: harmonics, Legendre series, tables and rules over the sphere."""
 
 import math
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import DEGREES, sphere_quadrature
@@ -153,30 +151,3 @@ def test_the_flux_through_a_face_is_exact_with_44_directions():
     directions, weights = RULES[44]
     flux = weights @ directions.abs()
     torch.testing.assert_close(flux, torch.full_like(flux, 0.5), rtol=1e-14, atol=0)
-
-
-@each_rule
-def test_directions_are_unit_and_weights_are_positive_and_sum_to_one(count: int):
-    directions, weights = RULES[count]
-    assert directions.shape == (count, 3)
-    torch.testing.assert_close(directions.norm(dim=1), torch.ones_like(weights), rtol=0, atol=1e-15)
-    assert weights.sum().item() == pytest.approx(1, abs=1e-15) and bool((weights > 0).all())
-
-
-IMAGES = {
-    "point": lambda points: -points,
-    "diagonal": lambda points: points.flip(1),
-    "turn": lambda points: points.roll(1, 1),
-    "plane": lambda points: points * torch.tensor([1.0, -1.0, 1.0]),
-}
-
-
-@each_rule
-@pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES.keys())
-def test_every_symmetry_of_the_cube_maps_the_rule_onto_itself(
-    count: int, image: Callable[[Tensor], Tensor]
-):
-    directions, weights = RULES[count]
-    is_same = (image(directions)[:, None] - directions).abs().amax(-1) < 1e-12
-    assert bool((is_same.sum(1) == 1).all()) and bool((is_same.sum(0) == 1).all())
-    assert torch.equal(weights[is_same.to(torch.int8).argmax(1)], weights)

@@ -13,8 +13,7 @@ from ddrecon.picture import render
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.metric import FieldMetric, find_diagonals
 from ddrecon.reconstruct.numbers import Point, find_matrix, single_numbers
-from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import total_variation
+from ddrecon.reconstruct.parameters import Parameter, total_variation
 from ddrecon.scene import Scene, View
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.values import value_of, with_values

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ddrecon.reconstruct import pace, tuning
+from ddrecon.reconstruct import loop, tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame
 
 
@@ -21,7 +21,7 @@ def test_a_line_through_two_resolutions(
         return evaluate(frame)
 
     monkeypatch.setattr(Frame, "evaluate", evaluate_slowly)
-    monkeypatch.setattr(pace, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
     cells = ball_scene.volume.grid.cells
-    assert pace.time_iteration(ball_scene) == pytest.approx(0.25 + cells / 1000)
+    assert loop.time_iteration(ball_scene) == pytest.approx(0.25 + cells / 1000)
     assert len(known) == (1 if fewest == 16 else 2)

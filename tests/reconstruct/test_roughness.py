@@ -7,7 +7,7 @@ import torch
 from media import make_scene, random_values
 
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.roughness import face_stiffness, total_variation
+from ddrecon.reconstruct.parameters import face_stiffness, total_variation
 
 
 def box(cells: int, side: float = 1.0) -> Grid:

@@ -17,6 +17,7 @@ from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.build_views import remove_pictures
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
 from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
 from ddrecon.scene_file.view_sources import MODELS, OTHERS, ring_cameras
@@ -97,8 +98,7 @@ def test_images_are_in_order_of_their_numbers(
     for path in reversed(paths):
         path.touch()
     (tmp_path / "targets" / "t_d.exr").mkdir()
-    ring = {name: value for name, value in RING.items() if name != "resolution"}
-    views = read(changed(views={"ring": ring, "images": pattern})).tree.views
+    views = read(changed(views={"ring": RING, "images": pattern})).tree.views
     assert [view.image for view in views] == paths
 
 
@@ -175,9 +175,7 @@ def test_points_are_seen_where_the_manual_says(
     first, second = scene_file.tree.views
     assert (first.name, second.name) == ("a", "b_c")
     assert second.image == tmp_path / "pictures" / "b c.png"
-    views = [view.__class__(**{**vars(view), "image": None}) for view in scene_file.tree.views]
-    tree = scene_file.tree.__class__(**{**vars(scene_file.tree), "views": tuple(views)})
-    scene = build_scene(SceneFile(tree, scene_file.path, scene_file.marks), dtype=torch.float64)
+    scene = build_scene(remove_pictures(scene_file, None), dtype=torch.float64)
     camera = scene.views[1].camera
     given = dict(zip(MODELS[model].split(), CAMERAS[model], strict=True))
     lens = "fisheye" if model == "OPENCV_FISHEYE" else "opencv"
@@ -243,23 +241,21 @@ def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
         read(scene_text())
 
 
-@pytest.mark.parametrize("store", [write_text, write_binary])
 @pytest.mark.parametrize("model", OTHERS)
 def test_cameras_that_no_image_has_may_be_of_any_model(
-    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+    read: Read, tmp_path: Path, model: str
 ) -> None:
-    folder, numbers = tmp_path / "sparse/0", [0.5] * OTHERS[model]
-    store(folder, "PINHOLE")
+    """As text, and in a binary file, which says nothing of their length."""
+    text, binary, count = tmp_path / "sparse/0", tmp_path / "sparse/1", OTHERS[model]
+    write_text(text, "PINHOLE")
+    write_binary(binary, "PINHOLE")
     before = read(scene_text()).tree
-    if store is write_text:
-        with (folder / "cameras.txt").open("a") as stream:
-            stream.write(f"8 {model} 8 6 {' '.join(map(str, numbers))}\n")
-    else:
-        count, cameras = struct.pack("<Q", 2), (folder / "cameras.bin").read_bytes()[8:]
-        kind = [*MODELS, *OTHERS].index(model)
-        strange = struct.pack(f"<iiQQ{len(numbers)}d", 8, kind, 8, 6, *numbers)
-        (folder / "cameras.bin").write_bytes(count + strange + cameras)
-    assert read(scene_text()).tree == before
+    with (text / "cameras.txt").open("a") as stream:
+        stream.write(f"8 {model} 8 6 {'0.5 ' * count}\n")
+    cameras, kind = (binary / "cameras.bin").read_bytes()[8:], [*MODELS, *OTHERS].index(model)
+    strange = struct.pack(f"<QiiQQ{count}d", 2, 8, kind, 8, 6, *[0.5] * count)
+    (binary / "cameras.bin").write_bytes(strange + cameras)
+    assert read(scene_text()).tree == read(scene_text(colmap="sparse/1")).tree == before
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import torch
 from media import box_grid, dense_matrix, half_empty, random_values
 from torch import Tensor
 
-from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.solve import solve_by_multigrid
@@ -124,17 +123,6 @@ def sweep_by_loops(
         scatters = (values * source).sum(0)[0]
         total += weight * values * by_cells(medium, scatters, even, w, inflow, steep)
     return total
-
-
-def mean_density(density: Tensor) -> Tensor:
-    """Cells' means of a density that is linear between centers, and even beyond the last."""
-    found = torch.zeros_like(density)
-    for cell in product(*(range(n) for n in density.shape)):
-        for offset in product((-1, 0, 1), repeat=3):
-            around = zip(cell, offset, density.shape, strict=True)
-            at = tuple(min(max(i + o, 0), n - 1) for i, o, n in around)
-            found[cell] += 6 ** offset.count(0) / 8**3 * density[at]
-    return found
 
 
 def share_by_loops(medium: Medium, directions: int) -> Tensor:
@@ -262,20 +250,6 @@ def test_the_share_of_a_change_is_that_of_the_mean_step(shape: tuple[int, int, i
     torch.testing.assert_close(share, share_by_loops(medium, 44), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4)], ids=str)
-def test_sweeps_see_the_means_of_cells(shape: tuple[int, int, int]):
-    """Of each field, whether both coefficients have the same one or not."""
-    for varies in (False, True):
-        medium = gray_medium(shape, 0.4, varies)
-        found = average_cells(medium)
-        for one, mean in (
-            (medium.extinction, found.extinction),
-            (medium.remaining, found.remaining),
-        ):
-            expected = mean.scale.view(-1, 1, 1, 1) * mean_density(one.field[0])
-            torch.testing.assert_close(mean.value, expected, rtol=1e-13, atol=1e-15)
-
-
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
 def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
     shape, degree = (2, 2, 3), 3 * (g != 0)
@@ -352,45 +326,6 @@ def test_slices_at_once_are_cells_one_by_one(direction):
     torch.testing.assert_close(found[0], expected, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("depth", [1e-4, 0.5, 30.0])
-def test_along_an_axis_a_linear_source_follows_the_closed_form(axis: int, sign: int, depth: float):
-    """Of q = q_0 + b s, I is a (b (s - l / k) + q_0 l), l = 1 - exp(-k s); its mean over cells."""
-    grid, albedo, q_0, b = box_grid((4, 5, 6)), 0.9, 2.0, 3.0
-    step, count = grid.spacing[axis], grid.shape[axis]
-    k = depth / step
-    medium = medium_of(torch.full(grid.shape, k / 4, dtype=torch.float64), grid, albedo)
-    ends = step * torch.arange(count + 1, dtype=torch.float64)
-    middle = (ends[1:] + ends[:-1]) / 2
-    lines = [q_0 + b * middle]
-    nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(60))
-    s = middle[:, None] + 0.5 * step * nodes
-    lost = -torch.expm1(-k * s)
-    lines.append((albedo * (b * (s - lost / k) + q_0 * lost)) @ weights / 2)
-    layout = [-1 if a == axis else 1 for a in range(3)]
-    scatters, expected = (
-        (line if sign > 0 else line.flip(0)).view(layout).expand(grid.shape) for line in lines
-    )
-    direction = tuple(float(sign * (a == axis)) for a in range(3))
-    found, *_ = radiance_along(
-        medium, scatters[None], cell_gradient(scatters[None]), None, direction
-    )
-    torch.testing.assert_close(found[0], expected, rtol=1e-9, atol=0)
-
-
-@each_direction
-def test_a_white_medium_in_a_white_room_stays_white(direction):
-    grid = box_grid((5, 4, 6))
-    medium = medium_of(30 * half_empty(5, 4, 6), grid, albedo=1.0, colors=3)
-    room = outside(2, 3, 5)
-    white = room.expand(3, *grid.shape)
-    mean, gone = radiance_along(medium, white, cell_gradient(white), room, direction)
-    torch.testing.assert_close(mean, white, rtol=1e-13, atol=0)
-    for beyond in gone:
-        torch.testing.assert_close(beyond, torch.zeros_like(beyond), rtol=0, atol=1e-13)
-
-
 @each_direction
 @pytest.mark.parametrize("thickness", [1e-6, 1.0, 1e4])
 def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: float):
@@ -406,44 +341,6 @@ def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: flo
     shares = 1.0, *map(abs, course.drift)
     left = sum(share * beyond.sum() for share, beyond in zip(shares, gone, strict=True))
     torch.testing.assert_close(emitted, absorbed + left, rtol=1e-12, atol=1e-13)
-
-
-@each_direction
-def test_what_a_cell_is_to_another_this_is_to_it_on_the_way_back(direction):
-    """Of even sources in cells, a sweep is the transpose of that of the opposite direction."""
-    grid = box_grid((4, 5, 3))
-    medium, one = medium_of(6 * half_empty(4, 5, 3), grid), random_source(grid)
-    other, even = one.flip(2), torch.zeros(3, *one.shape, dtype=torch.float64)
-    back = tuple(-c for c in direction)
-    there, *_ = radiance_along(medium, one, even, None, direction)
-    here, *_ = radiance_along(medium, other, even, None, back)
-    strength = medium.remaining.value
-    torch.testing.assert_close(
-        (strength * other * there).sum(), (strength * one * here).sum(), rtol=1e-13, atol=0
-    )
-
-
-@pytest.mark.parametrize("depth", [1.0, 5.0, 100.0])
-def test_long_waves_spread_as_far_as_light_goes_whatever_the_depth_of_cells(depth: float):
-    """Of q = x^2 / 2, light along x and against it is q + q'' / kappa_t^2, far from faces."""
-    grid = Grid((1, 1, 121), (0.0, 0.0, 0.0), (1.0, 1.0, 121.0))
-    medium = medium_of(torch.full(grid.shape, depth / 4, dtype=torch.float64), grid, albedo=1.0)
-    q = (0.5 * (torch.arange(121, dtype=torch.float64) - 60) ** 2).view(1, *grid.shape)
-    along, against = (
-        radiance_along(medium, q, cell_gradient(q), None, (0.0, 0.0, way))[0] for way in (1.0, -1.0)
-    )
-    more = ((along + against) / 2 - q)[0, 0, 0, 55:66] * depth**2
-    torch.testing.assert_close(more, torch.ones_like(more), rtol=0, atol=1e-8)
-
-
-@each_direction
-def test_radiance_of_even_sources_is_never_negative(direction):
-    grid = box_grid((6, 5, 4))
-    for seed, thickness in enumerate((1e-6, 1.0, 1e3, 1e6)):
-        medium = medium_of(thickness * half_empty(6, 5, 4, seed=seed), grid)
-        sharp = random_values(1, *grid.shape, seed=seed) ** 20
-        even = torch.zeros(3, *sharp.shape, dtype=torch.float64)
-        assert bool((radiance_along(medium, sharp, even, None, direction)[0] >= 0).all())
 
 
 @each_direction
