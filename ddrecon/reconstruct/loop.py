@@ -152,8 +152,8 @@ class Reconstruction:
 
         Both are parts of that of the pictures, as the loss compares them.
         """
-        unit = self.problem.power or 1.0
-        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
+        residual = math.sqrt(self.total.data_loss / self.problem.unit)
+        noise = math.sqrt(self.noise_loss)
         ending: dict[str, Any] = self.schedule.ending(self.iteration)
         ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
         return ending | {"residual": residual, "noise": noise}

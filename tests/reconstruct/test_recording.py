@@ -79,7 +79,7 @@ def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
     values, compared = leaves_of(scene, 0.5), compare(scene, "one")
     objective = replays.differentiate(values, compared, memory)
     assert_same(objective, differentiate_plainly(scene, values, "one"))
-    assert len(compared.metrics["psnr"]) == 1
+    assert len(compared.psnrs) == 1
 
 
 def test_what_cannot_be_recorded_runs_plainly(
