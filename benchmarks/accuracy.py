@@ -1,6 +1,6 @@
 """How far images and derivatives are from path-traced ones: tables in Markdown.
 
-    python benchmarks/accuracy.py eleven|derivative|angles|volumes|grounds --references FOLDER
+    python benchmarks/accuracy.py eleven|derivative|angles|volumes|grounds|thick --references FOLDER
 
 `eleven`: the cases of FOLDER/images/cases.json, whose images lie beside it. `derivative`: by all
 the density of some of them, against central differences (FOLDER/fd_gradients.json).
@@ -8,6 +8,11 @@ the density of some of them, against central differences (FOLDER/fd_gradients.js
 by Mitsuba 3 (extra `reference`) and kept there. An error is the relative RMS error of the image in
 linear radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that
 noise.
+
+`thick`: where cells are optically thick, against our own images on a grid six times as fine: the
+same density, linear between the centers of the coarse grid, with angles to degree 5 and five
+rounds. `default` is what a scene file gets; the others have cells as they are, or `a third` as
+wide. Merged balls are lit from the side or the eye; `block` fills its box.
 """
 
 from __future__ import annotations
@@ -18,20 +23,26 @@ import math
 import re
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from figures import print_header, print_row
 from torch import Tensor
+from torch.nn.functional import interpolate
 
-from ddrecon.bench.plume import fade, plume_density
+from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
+from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import render
 from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import RenderSettings
+from ddrecon.validate.hard import fade, plume_density
 from ddrecon.variables.values import with_values
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -279,15 +290,6 @@ def as_seen(error: float, noise: float) -> str:
     return f"{error:.3f}" if error > noise / 3 else f"< {noise / 3:.3f}"
 
 
-def print_row(*cells: object) -> None:
-    print(f"| {' | '.join(map(str, cells))} |", flush=True)
-
-
-def print_header(*names: str) -> None:
-    print_row(*names)
-    print_row(*["---"] * len(names))
-
-
 def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
     """The name, scene file and path-traced image of each of the eleven cases."""
     found = []
@@ -365,10 +367,63 @@ def print_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> None:
         print_row(case.name, f"{traced.noise:.3f}", *errors)
 
 
+THICK_CELLS, FINER = 12, 6
+BALLS = together(around((-0.13, -0.08, 0.05), 0.32, 0.2), around((0.17, 0.1, -0.05), 0.27, 0.2))
+SHOWN: dict[str, tuple[Field, Vector, Vector]] = {
+    "side": (BALLS, SIDE, FRONT),
+    "eye": (BALLS, (2.0, -1.2, 2.2), FAR),
+    "block": (lambda x, y, z: torch.ones_like(x * y * z), (-1.0, -1.2, -1.5), (1.3, 1.1, 2.6)),
+}
+"""By a name, what is lit, the way light travels and the eye."""
+
+
+def by_dial(rounds: int, degree: int, times: int = 1) -> tuple[str, ...]:
+    keys = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    return tuple(f"diffusion.{key}={value}" for key, value in keys.items())
+
+
+THICK_MODELS = {
+    "n = 0": by_dial(0, 1),
+    "n = 1, L = 1": by_dial(1, 1),
+    "n = 1, L = 3": by_dial(1, 3),
+    "n = 3, L = 3": by_dial(3, 3),
+    "n = 1, L = 3, a third": by_dial(1, 3, 3),
+    "n = 3, L = 3, a third": by_dial(3, 3, 3),
+    "default": (),
+}
+"""Overrides by column: n transport rounds of degree L, samples of rays as by default."""
+
+
+def refine(scene: Scene) -> Scene:
+    """`scene` in finer cells, two samples in each."""
+    volume = scene.volume
+    density = interpolate(volume.density[None, None], scale_factor=FINER, mode="trilinear")[0, 0]
+    grid = Grid(tuple(density.shape), volume.grid.lower, volume.grid.upper)
+    finer = Volume(grid, density, volume.sigma_a, volume.sigma_s, volume.phase)
+    return replace(scene, volume=finer, render=RenderSettings(4, 2, 0.0))
+
+
+@torch.no_grad()
+def print_thick(place: Path) -> None:
+    """A row by g, optical depths a cell, and what is lit."""
+    print_header("g", "depth of a cell", "lit from", *THICK_MODELS)
+    for g, depth, lit in product((-0.8, 0.0, 0.6, 0.8), (1.0, 4.0, 8.0), SHOWN):
+        field, travel, eye = SHOWN[lit]
+        sigma_t, camera = depth * THICK_CELLS, perspective(eye, 22.0)
+        path = Case(lit, field, sigma_t, 0.95, g, (sun(travel),), camera).write(place, THICK_CELLS)
+        views = "views.0.camera.resolution=[16, 16]"
+        truth = render(refine(load_scene(path, overrides=(views, *by_dial(5, 5)))))
+        images = (
+            render(load_scene(path, overrides=(views, *model))) for model in THICK_MODELS.values()
+        )
+        errors = (float((image - truth).norm() / truth.norm()) for image in images)
+        print_row(str(g), f"{depth:g}", lit, *(f"{error:.3f}" for error in errors))
+
+
 def main() -> None:
     """Prints what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("eleven", "derivative", *CASES))
+    parser.add_argument("what", choices=("eleven", "derivative", "thick", *CASES))
     parser.add_argument("--references", type=Path, default=Path("references"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -376,6 +431,8 @@ def main() -> None:
             print_eleven(given.references, Path(name))
         elif given.what == "derivative":
             print_derivatives(given.references, Path(name))
+        elif given.what == "thick":
+            print_thick(Path(name))
         else:
             print_cases(CASES[given.what], given.references, Path(name))
 

@@ -32,8 +32,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from figures import print_header, print_row
 from path_replay import DENSITY, Replay, why_not
-from reconstruction import ROOT, coarsened, print_row
+from reconstruction import ROOT, coarsened
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -216,8 +217,7 @@ def main() -> None:
     if not path.exists():
         trace_pictures(write_scene(given.cloud.resolve(), folder), folder)
     scene, truth = load_scene(path), read_field(folder / "truth.npz", "density").values
-    print_row("who", "held out", "L1", "mass", "iterations", "processor s")
-    print_row(*["---"] * 6)
+    print_header("who", "held out", "L1", "mass", "iterations", "processor s")
 
     def judge(who: str, density: np.ndarray, iterations: int, seconds: float) -> None:
         error = float(np.abs(density - truth).sum() / truth.sum())

@@ -35,6 +35,11 @@ def bar_settings(is_quiet: bool) -> dict[str, Any]:
     return settings
 
 
+def show_progress(items: Sequence[Any], text: str, is_quiet: bool) -> Iterable[Any]:
+    """The `items` one by one, beside a bar of this `text` on stderr, unless `is_quiet`."""
+    return tqdm(items, desc=text, leave=False, **bar_settings(is_quiet))
+
+
 def say(text: str, is_quiet: bool) -> None:
     """Writes `text` to stderr, above all bars, unless `is_quiet`."""
     if not is_quiet:

@@ -17,12 +17,11 @@ from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
-from ddrecon.numerics.legendre import legendre
+from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.tangents import varied
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import varied, with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""

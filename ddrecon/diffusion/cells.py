@@ -12,8 +12,8 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES
 from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.periods import apply_around
-from ddrecon.numerics.third_order import second_difference
+from ddrecon.numerics.interpolation import second_difference
+from ddrecon.numerics.layout import apply_around
 
 THIN = 1.5
 """Optical depths of a cell up to which light is as good as straight in it."""

@@ -188,5 +188,5 @@ def _divergence_error(operator: PrintedOperator, iteration: int, relative: float
         f"neighbor by a factor above 4; the largest is {float(ratio[z, y, x]):.1f} at cell "
         f"{(x, y, z)}"
     )
-    advice = "raise diffusion.floor or use diffusion.scheme=conservative"
+    advice = "use diffusion.scheme=conservative"
     return SolveError(message, iteration, relative, advice)

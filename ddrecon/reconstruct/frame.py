@@ -124,10 +124,16 @@ class Frame:
         Raises SolveError and NotFiniteError.
         """
         compared, unit = Comparison(self.level.train.views, self.level.targets), self.problem.unit
-        differentiated = self._differentiate(compared)
-        priors = {p.name: pair for p in self.parameters if (pair := p.penalty()) is not None}
-        penalty = sum((value for value, _ in priors.values()), differentiated.loss.new_zeros(()))
-        of_images, prior, psnr = compared.read(differentiated, penalty, self.parameters)
+        numbers = None
+        while numbers is None:
+            differentiated = self._differentiate(compared)
+            priors = {p.name: pair for p in self.parameters if (pair := p.penalty()) is not None}
+            terms = (value for value, _ in priors.values())
+            penalty = sum(terms, differentiated.loss.new_zeros(()))
+            numbers = compared.read(differentiated, penalty, self.parameters)
+            if numbers is None:
+                self.replays.forget(compared, self.memory)
+        of_images, prior, psnr = numbers
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
         bars = {name: bar for name, (_, bar) in priors.items()}

@@ -28,11 +28,15 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Differentiated:
-    """The `loss` of all views, its derivatives by name, and `images` [3, h, w] of this rank's."""
+    """The `loss` of all views, its derivatives by name, and `images` [3, h, w] of this rank's.
+
+    They are worth nothing where a relative residual, one of `residuals`, exceeds its limit.
+    """
 
     images: list[Tensor]
     loss: Tensor
     gradients: dict[str, Tensor]
+    residuals: Sequence[tuple[Tensor, float]] = ()
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ class Reconstruction:
         before = self.search.state()
         while True:
             is_first = not self.search.values
-            candidate = self._project(self._values()) if is_first else self.search.candidate()
+            candidate = self._project(self._values()) if is_first else self.search.candidate
             self._put(candidate)
             try:
                 return candidate, [frame.evaluate() for frame in self.frames]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -75,17 +76,22 @@ class Comparison:
 
     def read(
         self, objective: Differentiated, penalty: Tensor, parameters: Sequence[Parameter]
-    ) -> tuple[float, float, float]:
+    ) -> tuple[float, float, float] | None:
         """The loss of images of an iteration, its `penalty`, and the images' mean PSNR [dB].
 
-        All are read at once, with the extremes of the derivatives. Raises NotFiniteError where a
-        loss, or a derivative by one of the `parameters`, is not finite.
+        All are read at once, with the extremes of the derivatives. None where a solve did not end.
+        Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not
+        finite.
         """
         gradients = objective.gradients
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-        numbers = torch.stack([objective.loss, penalty, *extremes, *self.psnrs]).tolist()
-        of_images, prior, *numbers = numbers
-        ends, psnrs = numbers[: len(extremes)], numbers[len(extremes) :]
+        residuals = [residual.to(penalty) for residual, _ in objective.residuals]
+        groups = [[objective.loss, penalty], residuals, extremes, self.psnrs]
+        flat = iter(torch.stack([number for group in groups for number in group]).tolist())
+        (of_images, prior), errors, ends, psnrs = (list(islice(flat, len(g))) for g in groups)
+        limits = (limit for _, limit in objective.residuals)
+        if not all(error <= limit for error, limit in zip(errors, limits, strict=True)):
+            return None
         if not all(map(math.isfinite, [of_images, prior, *ends])):
             self.require_finite()
             for p in parameters:

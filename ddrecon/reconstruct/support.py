@@ -104,9 +104,7 @@ class Support:
             yield index[is_cut], every, alone
 
 
-def describe_support(
-    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
-) -> dict[str, Any] | None:
+def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
     `cells` is the part of the cells of `grid` that any keeps, `lonely` that of which fewer than two
@@ -114,7 +112,7 @@ def describe_support(
     """
     if not supports:
         return None
-    described = doubt_support(supports, grid, upright)
+    described = doubt_support(supports, grid)
     if not described.get("doubt", "").startswith(OUTSIDE):
         kept = torch.stack([support.on(grid) for support in supports]).any(0)
         _, seen = supports[0]._hulls(grid)
@@ -123,17 +121,15 @@ def describe_support(
     return described
 
 
-def doubt_support(
-    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
-) -> dict[str, Any]:
+def doubt_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any]:
     """The corners (x, y, z) of the `box` that would do, and what is in `doubt` of that of `grid`.
 
-    Neither where the pictures do not tell; `upright` is as for `doubt_box`.
+    Neither where the pictures do not tell.
     """
     with suppress(HullError):
         frames = [(support.views, support.shown) for support in supports]
         box = bound_smoke(frames, supports[0].margin)
-        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz), upright)
+        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz))
         return {"box": box.tolist()} | ({} if doubt is None else {"doubt": doubt})
     return {}
 

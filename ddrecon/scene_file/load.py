@@ -93,7 +93,7 @@ def read_scene(
     problems.raise_any()
     assert scene_file is not None
     if AUTO in (scene_file.tree.volume.bounds, scene_file.tree.volume.resolution):
-        from ddrecon.scene_file.box import fit_volume  # here, as it loads torch
+        from ddrecon.scene_file.build_views import fit_volume  # here, as it loads torch
 
         return fit_volume(scene_file)
     return scene_file

@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -29,24 +28,6 @@ Pair = tuple[float, float]
 AXES = {"choices": ("x", "y", "z"), "may_be_empty": True}
 
 MAX_CELLS = 2**30
-
-
-@dataclass(frozen=True)
-class Profile:
-    """Values by height, such as those of a gas; `media` has how air stands beside a cloud.
-
-    heights: Along `volume.up` [u], each above the one before.
-    values: One at each height; linear between them, and even beyond.
-    """
-
-    heights: tuple[float, ...]
-    values: tuple[Color, ...]
-
-    def violations(self) -> Iterator[Violation]:
-        if any(after <= before for before, after in pairwise(self.heights)):
-            yield "heights", "must go up from one to the next"
-        if len(self.values) != len(self.heights) or not self.heights:
-            yield "values", f"expected one for each height, {len(self.heights)}"
 
 
 @dataclass(frozen=True)
@@ -74,7 +55,7 @@ class ByLabel:
     name: str = "labels"
 
 
-ByCell = FieldFile | Profile | ByLabel
+ByCell = FieldFile | ByLabel
 Density = float | ByCell
 Quantity = Color | ByCell
 
@@ -212,7 +193,7 @@ class BoxSection:
         where left out. `auto`: what fits the pictures.
     resolution: Cells along x, y and z; left out: those of the file; `auto`: cubes two pixels
         wide, for which the box may grow, but not along its period.
-    up: The axis along which `heights`, a `ground` and rings count, and which `export --up` turns.
+    up: The axis along which a `ground` and rings count, and which `export --up` turns.
     periodic: The axes, one or two, along which the volume repeats without end, as `[x, z]`
         ([E2.15](theory.md#2-the-forward-model)). Lights are directional, ambient or maps; the
         diffusion is `p1` by the scheme `conservative`, or none.
@@ -425,12 +406,6 @@ class SceneTree:
     def violations(self) -> Iterator[Violation]:
         if not self.lights and not self.glows:
             yield "lights", "there is none, and the volume has no emission"
-        for name in self.optimize.parameters if self.optimize else ():
-            medium, last = split_name(name)
-            section = self.media.get(medium.removeprefix("media.").strip("."))
-            has_g = section and isinstance(section.phase, HenyeyGreensteinSection | None)
-            if last == "phase.g" and has_g:
-                yield "optimize", f"parameters.{name} is called {medium}g here"
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:

@@ -12,10 +12,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,9 +40,9 @@ if TYPE_CHECKING:
     from ddrecon.scene_file.load import SceneFile
 
 MAX_BYTES = 64 * 2**20
-TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
-TRAIN_NAME = re.compile(r"(?<![a-z])train(?![a-z])", re.IGNORECASE)
-LISTS = ("train_filenames", "test_filenames", "val_filenames")
+OF_TESTS = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
+OF_TRAINING = re.compile(r"(?<![a-z])train(?![a-z])", re.IGNORECASE)
+TEST_LISTS = ("test_filenames", "val_filenames")
 OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Camera models whose distortion is OpenCV's, as far as they have some."""
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -66,6 +64,14 @@ GROUPS = (
     ("camera_model", "is_fisheye"),
 )
 """What belongs together: of a group that a frame has any of, nothing of the file counts."""
+NUMBERS: Mapping[str, Mapping[str, float]] = {
+    **{f"camera_angle_{axis}": {"above": 0, "below": math.pi} for axis in "xy"},
+    **{f"{axis}_fov": {"above": 0, "below": 180} for axis in "xy"},
+    **{f"fl_{axis}": {"above": 0} for axis in "xy"},
+    **{side: {"minimum": 1, "maximum": 16384} for side in "wh"},
+    **{f"c{axis}": {} for axis in "xy"},
+}
+"""What a camera says of its picture, and within which limits."""
 MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
 """What is refused, as it is not read, of a frame that says no focal length besides."""
 NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
@@ -120,49 +126,25 @@ def node_of(key: str, where: str, value: Any) -> Node:
 
 
 def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSection]:
+    """Test views are those of the file's lists, or all by its name, or one in `test_every`."""
     if not isinstance(root.value, dict) or "frames" not in root.value:
         raise root.refused(
             "has no 'frames'; expected a transforms.json as of NeRF, instant-ngp or nerfstudio"
         )
-    frames, folder = root.value["frames"], path.absolute().parent
+    shared, frames, folder = root.value, root.value["frames"], path.absolute().parent
     if not isinstance(frames.value, list) or not frames.value:
         raise frames.refused("expected a list with at least one frame")
-    splits = _listed_splits(root.value, frames.value)
-    read = partial(_frame_view, shared=root.value, folder=folder)
-    if splits:
-        listed = [
-            (frame, split) for frame, split in zip(frames.value, splits, strict=True) if split
-        ]
-        views = gather(lambda entry: replace(read(entry[0]), split=entry[1]), listed)
-    else:
-        views = gather(read, frames.value)
-    if not views:
-        raise root.refused("its lists of files name no frame")
-    if is_test := TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem):
-        test_every = 1 if is_test.re is TEST_NAME else None
-    return views if splits else split_views(views, test_every)
+    lists = [shared[name] for name in TEST_LISTS if name in shared]
+    tests = [read_as(entry, Path, folder) for listed in lists for entry in listed.children()]
+    views = gather(lambda frame: _frame_view(frame, shared, folder, tests), frames.value)
+    if OF_TESTS.search(path.stem):
+        test_every = 1
+    elif lists or OF_TRAINING.search(path.stem):
+        test_every = None
+    return split_views(views, test_every)
 
 
-def _listed_splits(entries: Entries, frames: Sequence[Node]) -> list[str | None]:
-    """The split of each frame by the lists of the file, where it has any.
-
-    It is None for one that they leave out, as nerfstudio does.
-    """
-    lists = {name: entries[name] for name in LISTS if name in entries}
-    named = [isinstance(frame.value, dict) and frame.value.get("file_path") for frame in frames]
-    paths = [node and Path(str(node.value).replace("\\", "/")) for node in named]
-    listed = dict[Path, str]()
-    for name, node in lists.items():
-        for entry in node.children():
-            path = Path(read_as(entry, str).replace("\\", "/"))
-            if path not in paths:
-                raise entry.refused(f"no frame has the file_path {entry.value!r}")
-            listed[path] = "train" if name == LISTS[0] else "test"
-    unlisted = None if LISTS[0] in lists else "train"
-    return [listed.get(path, unlisted) if path else "train" for path in paths if lists]
-
-
-def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
+def _frame_view(frame: Node, shared: Entries, folder: Path, tests: Collection[Path]) -> ViewSection:
     """The view of a `frame` of a file in `folder`, whose `shared` entries hold for all frames."""
     from ddrecon.io.images.films import FILMS
     from ddrecon.io.images.table import READERS  # here, as it loads numpy
@@ -173,8 +155,8 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
         return read_as(entries[name], hint, folder) if name in entries else default
 
     image, mask = read("file_path", Path), read("mask_path", Path)
-    has_focal = not entries.keys().isdisjoint(FOCAL)
-    if (matrices := entries.keys() & set(MATRICES)) and not has_focal:
+    split = "test" if image in tests else "train"
+    if (matrices := entries.keys() & set(MATRICES)) and entries.keys().isdisjoint(FOCAL):
         raise entries[min(matrices)].refused("is not read: write fl_x, fl_y, cx, cy, w and h")
     camera = read_camera(frame, _override(shared, entries), folder)
     if image is None and camera.resolution is None:
@@ -190,7 +172,7 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     is_film = image is not None and image.suffix.lower() in FILMS
     time = read("time", float, 0.0) if is_film else 0.0
     number = read("frame", int, 0)
-    return ViewSection(camera=camera, image=image, mask=mask, frame=number, time=time)
+    return ViewSection(camera=camera, image=image, mask=mask, frame=number, time=time, split=split)
 
 
 def _override(shared: Entries, entries: Entries) -> Entries:
@@ -213,21 +195,8 @@ def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSecti
     return camera
 
 
-NUMBERS: Mapping[str, Mapping[str, float]] = {
-    **{f"camera_angle_{axis}": {"above": 0, "below": math.pi} for axis in "xy"},
-    **{f"{axis}_fov": {"above": 0, "below": 180} for axis in "xy"},
-    **{f"fl_{axis}": {"above": 0} for axis in "xy"},
-    **{side: {"minimum": 1, "maximum": 16384} for side in "wh"},
-    **{f"c{axis}": {} for axis in "xy"},
-}
-"""What a camera says of its picture, and within which limits."""
-
-
 def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
-    """`fov`, and where the image's size is known, the rest that a camera needs.
-
-    That is `resolution`, `principal_point` and `pixel_aspect`.
-    """
+    """`fov`; with the image's size `resolution`, `principal_point` and `pixel_aspect` as well."""
     numbers: dict[str, float] = {
         name: read_as(entries[name], float, Path(), **limits)
         for name, limits in NUMBERS.items()
@@ -238,9 +207,8 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
     if not {"w", "h"} <= numbers.keys():
         for name in ("fl_x", "fl_y", "cx", "cy"):
             if name in numbers:
-                raise entries[name].refused(
-                    "is in pixels, but w and h do not say how many there are"
-                )
+                fault = "is in pixels, but w and h do not say how many there are"
+                raise entries[name].refused(fault)
         if "x_fov" not in numbers and "camera_angle_x" not in numbers:
             raise frame.refused("says how high its picture is, but not how wide: give w and h")
         return {"fov": numbers.get("x_fov") or math.degrees(numbers["camera_angle_x"])}
@@ -250,11 +218,13 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
             raise entries[name].refused(f"expected a whole number, found {numbers[name]:g}")
     focal_x, focal_y = _focal(numbers, "x", width), _focal(numbers, "y", height)
     focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
-    center = numbers.get("cx", width / 2) / width, numbers.get("cy", height / 2) / height
     return {
         "fov": 2 * math.degrees(math.atan(width / 2 / focal_x)),
         "resolution": (int(width), int(height)),
-        "principal_point": center,
+        "principal_point": (
+            numbers.get("cx", width / 2) / width,
+            numbers.get("cy", height / 2) / height,
+        ),
         "pixel_aspect": focal_x / focal_y,
     }
 
@@ -270,29 +240,26 @@ def _focal(numbers: Mapping[str, float], axis: str, pixels: float) -> float:
 
 def _distortion(entries: Entries) -> LensSection | None:
     """The lens; None for a pinhole. Raises SceneError for a model that is not known."""
-    model, is_fisheye = "", False
+    model = ""
     if "camera_model" in entries:
         model = read_as(entries["camera_model"], str).upper()
         if model not in (*OPENCV, *FISHEYE):
             fault = f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
             raise entries["camera_model"].refused(fault)
-    for name in (*UNKNOWN, *UNNAMED):
-        if name in entries and any(
-            leaf.value for leaf in entries[name].walk() if not leaf.children()
-        ):
+    for name in (name for name in (*UNKNOWN, *UNNAMED) if name in entries):
+        if any(leaf.value for leaf in entries[name].walk() if not leaf.children()):
             fault = f"is of a lens that is not modeled; {REMEDY}"
             raise entries[name].refused(
                 fault if name in UNKNOWN else "is not read: write k1, k2, ..."
             )
+    is_fisheye = model in FISHEYE
     if "is_fisheye" in entries:
-        is_fisheye = bool(read_as(entries["is_fisheye"], bool | int))
-    is_fisheye = is_fisheye or model in FISHEYE
+        is_fisheye |= bool(read_as(entries["is_fisheye"], bool | int))
     section = FisheyeSection if is_fisheye else OpencvSection
-    nodes = {name: entries[name] for name in COEFFICIENTS if name in entries}
-    lens = {name: read_as(node, float) for name, node in nodes.items()}
+    lens = {name: read_as(entries[name], float) for name in COEFFICIENTS if name in entries}
     for name in set(lens) - set(LENSES[section.type]):
         if (value := lens.pop(name)) != 0:
-            raise nodes[name].refused(f"{name} = {value:g} is not modeled; {REMEDY}")
+            raise entries[name].refused(f"{name} = {value:g} is not modeled; {REMEDY}")
     return section(**lens) if is_fisheye or any(lens.values()) else None
 
 
@@ -306,7 +273,7 @@ def export_transforms(
     parallel projection.
     """
     require_free_files([path], may_exist=may_exist)
-    frames, folder, splits = [], path.absolute().parent, {name: list[str]() for name in LISTS}
+    frames, tests, folder = list[dict[str, Any]](), list[str](), path.absolute().parent
     for view, section in zip(scene.views, scene_file.tree.views, strict=True):
         files = {"file_path": section.image, "mask_path": section.mask}
         names = {
@@ -315,11 +282,10 @@ def export_transforms(
             if file is not None
         }
         frames.append(names | {"frame": section.frame, "time": section.time} | _camera(view))
-        for name in LISTS[1:] if view.is_test else LISTS[:1]:
-            splits[name] += [names["file_path"]] if "file_path" in names else []
+        tests += [names["file_path"]] if view.is_test and "file_path" in names else []
     models = {frame["camera_model"] for frame in frames}
     model = models.pop() if len(models) == 1 else "PINHOLE"
-    lists = splits if any(view.is_test for view in scene.views) else {}
+    lists = {TEST_LISTS[0]: tests} if tests else {}
     write_json(path, {"camera_model": model, **lists, "frames": frames})
     return [path]
 

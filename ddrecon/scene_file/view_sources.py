@@ -31,17 +31,15 @@ from ddrecon.scene_file.view_schema import (
     split_views,
 )
 
-MODELS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fl_x fl_y cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
 }
-"""The camera models that are read, in the order of their numbers in binary files, with their
-parameters in order.
-"""
+"""The models that are read, in the order of their numbers in binary files, and their parameters."""
 OTHERS = {
     "FULL_OPENCV": 12,
     "FOV": 5,
@@ -50,8 +48,7 @@ OTHERS = {
     "THIN_PRISM_FISHEYE": 12,
     "RAD_TAN_THIN_PRISM_FISHEYE": 16,
 }
-"""The next models, whose cameras may be there but have no image, and how many parameters they have.
-"""
+"""Models of which no image may be, and how many parameters they have."""
 Lens = tuple[str, tuple[int, int], Sequence[float]]
 """A camera of a model: what it is called, its width and height, and its parameters."""
 DECIMAL = r"(?:(?<=_)-)?[0-9]+(?:\.[0-9]+)?"
@@ -186,8 +183,8 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
         camera = _camera(of_cameras, number, *cameras[number])
         frame = camera | {"transform_matrix": _matrix(path, name, pose)}
         with in_file(of_cameras):
-            said = node_of(f"camera {number}", str(of_cameras), frame)
-            section = read_camera(said, said.entries(), folder)
+            described = node_of(f"camera {number}", str(of_cameras), frame)
+            section = read_camera(described, described.entries(), folder)
         views.append(ViewSection(camera=section, image=path_in(images, name)))
     return views
 
@@ -213,57 +210,46 @@ def _camera(
     path: Path, number: int, model: str, size: tuple[int, int], parameters: Sequence[float]
 ) -> dict[str, Any]:
     """Camera `number` in the words of transforms.json."""
-    names = MODELS.get(model, ())
     if model not in MODELS:
         raise FormatError(path, f"camera {number}: lens model {model} is not known; {REMEDY}")
+    names = MODELS[model].split()
     if len(parameters) != len(names):
-        what = f"{model} has {len(names)} parameters, {', '.join(names)}"
-        raise FormatError(path, f"camera {number}: {what}")
-    given = dict(zip(names, parameters, strict=True))
-    focal = given.pop("f", 0.0)
-    lens = {"camera_model": model, "w": size[0], "h": size[1], "fl_x": focal, "fl_y": focal}
-    return lens | given
+        fault = f"{model} has {len(names)} parameters, {', '.join(names)}"
+        raise FormatError(path, f"camera {number}: {fault}")
+    lens = dict(zip(names, parameters, strict=True))
+    if "f" in lens:
+        lens["fl_x"] = lens["fl_y"] = lens.pop("f")
+    return {"camera_model": model, "w": size[0], "h": size[1], **lens}
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """The lines of a text file that are no comments, with their numbers."""
+    """The lines of a text file that are neither empty nor comments, with their numbers."""
     with path.open(encoding="utf-8-sig") as stream:
         for number, line in enumerate(map(str.strip, stream), 1):
-            if not line.startswith("#"):
+            if line and not line.startswith("#"):
                 yield number, line
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for number, line in _lines(path):
-        if not line:
-            continue
         try:
             camera, model, width, height, *parameters = line.split()
-            index = int(camera)
-            lens = model, (int(width), int(height)), [*map(float, parameters)]
+            yield int(camera), (model, (int(width), int(height)), [*map(float, parameters)])
         except ValueError as error:
-            raise FormatError(
-                path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
-            ) from error
-        yield index, lens
+            expected = f"CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
+            raise FormatError(path, f"line {number}: expected {expected}") from error
 
 
 def _text_images(path: Path) -> Iterator[Posed]:
-    """After the line of an image there may be one of its points, which may be empty."""
-    may_be_points = False
     for number, line in _lines(path):
-        if not line or (may_be_points and _are_points(line)):
-            may_be_points = False
+        if _are_points(line):  # of the image before, whose line of points may be missing
             continue
         try:
-            _, *numbers = (words := line.split(maxsplit=9))[:8]
-            pose, camera, name = [float(word) for word in numbers], int(words[8]), words[9]
+            words = line.split(maxsplit=9)
+            yield words[9], int(words[8]), [float(word) for word in words[1:8]]
         except (ValueError, IndexError) as error:
-            raise FormatError(
-                path, f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            ) from error
-        yield name, camera, pose
-        may_be_points = True
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise FormatError(path, f"line {number}: expected {expected}") from error
 
 
 def _are_points(line: str) -> bool:
@@ -277,7 +263,7 @@ def _are_points(line: str) -> bool:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
-    lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
+    lengths = {name: len(words.split()) for name, words in MODELS.items()} | OTHERS
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
             number, model, width, height = _unpack(path, stream, "<IiQQ")
@@ -291,9 +277,7 @@ def _binary_images(path: Path) -> Iterator[Posed]:
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
             _, *pose, camera = _unpack(path, stream, "<I7dI")
-            name = bytearray()
-            while (letter := _unpack(path, stream, "c")[0]) != b"\0":
-                name += letter
+            name = b"".join(iter(lambda: _unpack(path, stream, "c")[0], b"\0"))
             (points,) = _unpack(path, stream, "<Q")
             if 24 * points > path.stat().st_size - stream.tell():
                 raise FormatError(path, "ends too soon")

@@ -18,11 +18,10 @@ from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill, join
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.constants import constant
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.periods import apply_around
+from ddrecon.numerics.layout import NEARLY, apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
-from ddrecon.numerics.slicing import NEARLY
+from ddrecon.numerics.remember import constant
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
 from ddrecon.transport.mirror import Mirror
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 from small_scene import contents
-from test_resume import press_ctrl_c_in
+from test_optimize_command import press_ctrl_c_in
 
 from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ddrecon.bench import measure, plume
+from ddrecon import bench
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.levels import scene_at_level
@@ -82,9 +82,9 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_field(tmp_path / "wdas_cloud_sixteenth.vdb", "density", np.ones((6, 5, 4)), box)
     for name in list(CASES)[2:]:
         monkeypatch.delitem(CASES, name)
-    monkeypatch.setattr(plume, "load_pair", coarse(plume.load_pair))
-    monkeypatch.setattr(measure, "QUICK_PATHS", (1, 2))
-    monkeypatch.setattr(measure, "variants_of", few(measure.variants_of))
+    monkeypatch.setattr(bench, "load_pair", coarse(bench.load_pair))
+    monkeypatch.setattr(bench, "QUICK_PATHS", (1, 2))
+    monkeypatch.setattr(bench, "variants_of", few(bench.variants_of))
 
 
 @pytest.mark.parametrize("page", list(filter(commands, PAGES)), ids=lambda page: page.stem)

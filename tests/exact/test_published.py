@@ -26,6 +26,8 @@ SLABS = {
     ("g 0.75", 8.0): {"R": 0.9, "up": 2.0, "T": 1.2, "down": 1.5},
     ("haze", 1.0): {"R": 0.5, "up": 3.0, "T": 0.2, "down": 0.8},
     ("haze", 8.0): {"R": 1.3, "up": 2.0, "T": 0.5, "down": 1.0},
+    ("backward", 1.0): {"R": 0.2, "up": 0.9, "T": 0.3, "down": 1.6},
+    ("backward", 8.0): {"R": 0.5, "up": 2.4, "T": 0.3, "down": 2.0},
 }
 """By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
 CLOUDS = {

@@ -13,7 +13,7 @@ from ddrecon.reconstruct.frame import Evaluation, Frame
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.run.checkpoint import FORMAT, load_checkpoint
+from ddrecon.run.job import FORMAT, load_checkpoint
 from ddrecon.scene import Scene, View
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"

@@ -26,8 +26,7 @@ from ddrecon.light.lights import PointLight
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.frame import Row
 from ddrecon.report import volumes
-from ddrecon.report.curve import Plot, draw_curve
-from ddrecon.report.page import page_text, write_page
+from ddrecon.report.page import Plot, draw_curve, page_text, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import (
     FARTHEST,

@@ -1,12 +1,10 @@
 """Scene files as records: each rule of the schema, told with line, column and key."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import yaml
-from example_scene import CAMERA, SCENE, changed
+from example_scene import CAMERA, SCENE, changed, volume
 
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene, referenced_files
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
@@ -99,11 +97,9 @@ RING = {"count": 1, "radius": 3, "fov": 30}
 OWN = ["shoot/own.npz", "shoot/r0.npy"]
 """Files of a scene in the folder `shoot`."""
 TYPED = {
-    "volume.g=0": OWN,
     "volume.density={file: a.npz}": ["a.npz", OWN[1]],
     "volume.density.file=b/../a.npz": ["b/../a.npz", OWN[1]],
     "lights=[{type: ambient, radiance: 1}, {type: environment, file: sky.npy}]": ["sky.npy", *OWN],
-    "optimize.parameters={density: {init: {file: a.npz}}}": ["a.npz", *OWN],
     f"views=[{{image: front.npy, camera: {CAMERA}}}]": ["front.npy", OWN[0]],
     f"views={{ring: {RING}, images: 'r*.npy'}}": ["r0.npy", OWN[0]],
     f"views.ring={RING}": OWN,
@@ -120,12 +116,10 @@ def test_paths_that_are_typed_start_at_the_current_folder(
     Path("shoot").mkdir()
     for picture in ("r0.npy", "shoot/r0.npy"):
         Path(picture).touch()
-    volume = yaml.safe_load(SCENE)["volume"] | {"density": {"file": "own.npz"}}
-    Path("shoot/scene.yaml").write_text(
-        changed(volume=volume, views={"ring": RING, "images": "r*.npy"})
-    )
-    found = referenced_files(read_scene("shoot/scene.yaml", [override]))
-    assert {*found} == {tmp_path / file for file in files}
+    views = {"ring": RING, "images": "r*.npy"}
+    Path("shoot/scene.yaml").write_text(volume(density={"file": "own.npz"}, views=views))
+    named = referenced_files(read_scene("shoot/scene.yaml", [override]))
+    assert {*named} == {tmp_path / file for file in files}
 
 
 @pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])
@@ -135,18 +129,6 @@ def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
     assert optimize is not None and optimize.parameters[name].max == 0.5
     optimize = read(text, f"optimize.parameters.{name}={{}}").tree.optimize
     assert optimize.parameters.keys() == {"density", name}
-
-
-def test_json_is_a_scene_too(tmp_path: Path, read: Read):
-    tree = yaml.safe_load(SCENE)
-    tree["lights"][0]["irradiance"] = 3.141592653589793
-    tree["diffusion"] = {"tolerance": 1e-05}
-    path = tmp_path / "scene.json"
-    path.write_text(json.dumps(tree, indent=1))
-    loaded = read_scene(path).tree
-    assert loaded.diffusion.tolerance == 1e-05
-    assert loaded.lights[0] == DirectionalSection((-2, -2, -1), 3.141592653589793)
-    assert loaded.volume == read(SCENE).tree.volume
 
 
 def test_marks_lead_later_errors_to_the_line(read: Read):

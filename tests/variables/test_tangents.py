@@ -10,8 +10,7 @@ from ddrecon.errors import UsageError
 from ddrecon.lighting import solve_light
 from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
-from ddrecon.variables.tangents import variation
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import value_of, variation, with_values
 
 STEP = 1e-5
 

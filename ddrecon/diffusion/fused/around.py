@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from ddrecon.kernels.cell_function import RowFunction
-from ddrecon.numerics.constants import constant
+from ddrecon.numerics.remember import constant
 
 _PLACE, _GIVEN = "Line3(row, nz, ny, nx), ", "int nz, ny, nx"
 

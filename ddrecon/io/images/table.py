@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.arrays import as_float32, check_size, read_npy
-from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.files.atomic import replace_file, write_bytes
+from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
 from ddrecon.io.images.color import (
     ORIENTATION,
     TOP_LEFT,
@@ -194,8 +193,7 @@ def png_of(pixels: np.ndarray) -> bytes:
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
     """Writes `png_of` these `pixels` to `path`."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(png_of(pixels))
+    write_bytes(path, png_of(pixels))
 
 
 def write_picture(

@@ -18,9 +18,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
-from ddrecon.io.files.arrays import check_size
-from ddrecon.io.volumes.field import Field, check_field
-from ddrecon.io.volumes.units import METERS, size_of
+from ddrecon.io.files.reading import check_size
+from ddrecon.io.volumes.field import METERS, Field, check_field, size_of
 
 LEVELS = "[pim]?lev|(model|pressure)_?lev|(air_)?pres|p$|isobaric|sigma|eta$|hybrid|atmosphere_"
 """How the names of axes begin that are no length but pressures, or numbers of levels."""

@@ -12,9 +12,9 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.march.fused.kernels import Layout
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.numerics.angle_table import STEPS, angle_of
+from ddrecon.numerics.layout import across
 from ddrecon.numerics.remember import remember
-from ddrecon.numerics.slicing import across
+from ddrecon.numerics.series import STEPS, angle_of
 
 
 class Packed(NamedTuple):

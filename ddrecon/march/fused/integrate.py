@@ -6,6 +6,7 @@ It is one differentiable function of tensors.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.kernels.launch import count_shares, launch_later, thread_count
+from ddrecon.kernels.launch import launch_later, thread_count
+from ddrecon.kernels.sums import Sums, type_of_sums
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
 from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
@@ -92,7 +94,8 @@ class Integrate(torch.autograd.Function):
         outputs["masses"] = outputs["masses"].double()
         packets, arguments = _arguments(cells, tensors, thread_count(rays))
         if any(needs := [tensor.requires_grad for tensor in tensors]):
-            launch_later(adjoint_kernel(layout, _case(layout, cells, needs)).kernel, rays)
+            case = _case(layout, cells, needs)
+            launch_later(adjoint_kernel(layout, case, type_of_sums(rays)).kernel, rays)
         integral_kernel(layout, cells.is_sliced).launch(packets, arguments, outputs)
         out, masses = outputs.values()
         return out, masses.to(rays.dtype, copy=True), masses
@@ -110,41 +113,42 @@ class Integrate(torch.autograd.Function):
         """Cotangents of the tensors that need them; of numbers always."""
         (masses, *tensors), needs = ctx.saved_tensors, ctx.needs_input_grad[2:]
         rays, numbers, fields = tensors[0], tensors[2], tensors[len(NAMES) :]
-        bars = [
-            tensor.new_zeros(tensor.shape) if is_needed and tensor.numel() else None
+        shapes = [
+            tensor.shape if is_needed and tensor.numel() else None
             for tensor, is_needed in zip(tensors, needs, strict=True)
         ]
-        rays_bar, angles_bar, _, table_bar, fronts_bar, *field_bars = bars
-
-        # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        sums = [table_bar, *field_bars]
-        size = sum(total.nbytes for total in sums if total is not None)
-        threads = count_shares(thread_count(rays), size)
-        shares = [sums] + [
-            [None if total is None else torch.zeros_like(total) for total in sums]
-            for _ in range(threads - 1)
-        ]
-        packets, arguments = _arguments(ctx.cells, tensors, threads)
+        rays_bar, angles_bar, fronts_bar = (
+            None if shapes[i] is None else rays.new_zeros(shapes[i]) for i in (0, 1, 4)
+        )
+        sums = Sums([*shapes[len(NAMES) :], shapes[3]], rays)
+        packets, arguments = _arguments(ctx.cells, tensors, len(sums.copies))
         arguments |= {"masses": masses, "packets": packets}
         outputs = _empty_outputs(ctx.layout, rays).items()
         for (name, empty), bar in zip(outputs, output_bars, strict=False):
             arguments[f"{name}_bar"] = empty.zero_() if bar is None else bar
+        kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs), type_of_sums(rays))
+        bounds = None
+        if rays.is_cuda:
+            most = masses.new_empty(ctx.layout.channels + 1, packets)
+            kernel.launch(packets, arguments, {"most": most})
+            arguments["bounds"] = most.sum(1)
+            parts = arguments["bounds"].split([*map(len, fields), 1])
+            asked = [shape is not None for shape in shapes[len(NAMES) :]]
+            bounds = torch.cat([*itertools.compress(parts, asked), parts[-1]])
         numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
         results = {"rays_bar": rays_bar, "angles_bar": angles_bar, "fronts_bar": fronts_bar}
-        adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs)).launch(
+        kernel.launch(
             packets,
             arguments,
             results | {"numbers_bar": numbers_bar},
             shares=[
-                {"table_bar": of_table, "bars": _channels(of_fields, fields)}
-                for of_table, *of_fields in shares
+                {"bars": _channels(of_fields, fields), "table_bar": of_table}
+                for *of_fields, of_table in sums.copies
             ],
         )
-        for share in shares[1:]:
-            for total, addend in zip(sums, share, strict=True):
-                if total is not None and addend is not None:
-                    total += addend
-        bars[2] = numbers_bar.sum(1).to(numbers.dtype)
+        *field_bars, table_bar = sums.total(bounds, fields[0][0].numel())
+        of_numbers = numbers_bar.sum(1).to(numbers.dtype)
+        bars = rays_bar, angles_bar, of_numbers, table_bar, fronts_bar, *field_bars
         return None, None, *bars
 
     @staticmethod
