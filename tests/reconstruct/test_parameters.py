@@ -36,6 +36,21 @@ def test_a_direction_keeps_its_length() -> None:
     assert float(moved.norm()) == pytest.approx(3.0)
 
 
+def test_what_a_move_changes_is_the_same_at_a_finer_resolution() -> None:
+    """The product of a move and of a change of the derivative, but for the blur of both."""
+
+    def miss(cells: int) -> float:
+        grid, finer = box_grid((cells, 2, 3)), box_grid((2 * cells, 4, 5))
+        place = (torch.arange(cells).double() + 0.5) / cells
+        move, slope = (w[:, None, None].expand(grid.shape) for w in (place.sin(), place.exp()))
+        parameter = Parameter("density", ParameterSettings(), move, grid)
+        parameter.refine(finer)
+        product = (parameter.carry(move, False) * parameter.carry(slope, True)).sum()
+        return abs(float(product / (move * slope).sum()) - 1)
+
+    assert miss(16) > 3.5 * miss(32) > 0
+
+
 def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order() -> None:
     """Interpolation alone blurs by the second power of a cell's width."""
 
