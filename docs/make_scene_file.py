@@ -66,6 +66,7 @@ SECTIONS: list[tuple[str, type]] = [
     ("volume: {media: ...}", schema.MixtureSection),
     ("volume.media.NAME", schema.MediumSection),
     ("volume.density, sigma_a, ...: {file: ...}", settings.FieldFile),
+    ("volume.density, sigma_a, ...: {heights: ...}", schema.ByHeight),
     ("volume.density, sigma_a, ...: {labels: ...}", schema.ByLabel),
     ("volume.sigma_t: {meters: ...}", schema.Water),
     ("volume.phase: {type: henyey_greenstein}", schema.HenyeyGreensteinSection),

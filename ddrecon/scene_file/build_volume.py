@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from ddrecon.scene_file.build_views import Maker
 from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.schema import (
     Bounds,
+    ByHeight,
     ByLabel,
     HenyeyGreensteinSection,
     MediumSection,
@@ -73,6 +74,7 @@ def build_media(maker: Maker) -> dict[str, Volume]:
     gather(_Medium.read_fields, media.values())
     fields = dict(entry for medium in media.values() for entry in medium.fields.values())
     grid = _agree_on_grid(maker.scene_file, fields)
+    gather(lambda medium: medium.spread_heights(grid), media.values())
     return {name: medium.build(grid) for name, medium in media.items()}
 
 
@@ -131,12 +133,7 @@ class _Medium:
 
     def look_up(self, variable: str, key: str, by_label: ByLabel, field: Field) -> Field:
         """`variable` in each cell by the table at `key`, of which `field` has the labels."""
-        kind, colors = kind_of(_kind_name(variable)), [np.ravel(row) for row in by_label.table]
-        if not kind.is_color and max(map(len, colors)) > 1:
-            raise self.refused(key, "expected numbers: colors belong to the cross sections")
-        table = np.stack(np.broadcast_arrays(*colors))
-        if not kind.allows(torch.from_numpy(table)):
-            raise self.refused(key, f"must be {kind.limits}")
+        table = self.table_of(variable, key, by_label.table)
         labels = field.values.astype(np.int64)
         if field.values.ndim != 3 or (labels != field.values).any() or labels.min() < 0:
             fault = f"{by_label.name} are not whole numbers from 0, one a cell"
@@ -144,8 +141,33 @@ class _Medium:
         if labels.max() >= len(table):
             fault = f"expected one for each label, {labels.max() + 1} with 0, found {len(table)}"
             raise self.refused(key, fault)
-        table = table.squeeze(1) if table.shape[1] == 1 else table
         return replace(field, values=table[labels].astype(np.float32))
+
+    def table_of(self, variable: str, key: str, rows: Sequence[Any]) -> np.ndarray:
+        """The `rows` of `variable` at `key`, numbers [n] or colors [n, 3]; else SceneError."""
+        kind, colors = kind_of(_kind_name(variable)), [np.ravel(row) for row in rows]
+        if not kind.is_color and max(map(len, colors)) > 1:
+            raise self.refused(key, "expected numbers: colors belong to the cross sections")
+        table = np.stack(np.broadcast_arrays(*colors))
+        if not kind.allows(torch.from_numpy(table)):
+            raise self.refused(key, f"must be {kind.limits}")
+        return table.squeeze(1) if table.shape[1] == 1 else table
+
+    def spread_heights(self, grid: Grid) -> None:
+        """Evaluates the quantities that are given by height at the centers of cells of `grid`."""
+        axis = "zyx".index(self.maker.tree.volume.up)
+        centers = grid.lower[axis] + grid.spacing[axis] * (np.arange(grid.shape[axis]) + 0.5)
+        for variable, (name, value) in self.quantities.items():
+            if isinstance(value, ByHeight):
+                key = f"{name}.values"
+                table = self.table_of(variable, key, value.values)
+                colors = [
+                    np.interp(centers, value.heights, color) for color in np.atleast_2d(table.T)
+                ]
+                column = np.stack(colors, -1) if table.ndim == 2 else colors[0]
+                ahead = column[(slice(None), *[None] * (2 - axis))]
+                cells = np.broadcast_to(ahead, (*grid.shape, *column.shape[1:])).copy()
+                self.fields[variable] = f"volume.{self.prefix}{key}", Field(cells)
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""

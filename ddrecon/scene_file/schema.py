@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -55,7 +56,25 @@ class ByLabel:
     name: str = "labels"
 
 
-ByCell = FieldFile | ByLabel
+@dataclass(frozen=True)
+class ByHeight:
+    """Values by height, such as those of a gas; `media` has how air stands beside a cloud.
+
+    heights: Along `volume.up` [u], each above the one before.
+    values: One at each height; linear between them, and even beyond.
+    """
+
+    heights: tuple[float, ...]
+    values: tuple[Color, ...]
+
+    def violations(self) -> Iterator[Violation]:
+        if any(after <= before for before, after in pairwise(self.heights)):
+            yield "heights", "must go up from one to the next"
+        if len(self.values) != len(self.heights) or not self.heights:
+            yield "values", f"expected one for each height, {len(self.heights)}"
+
+
+ByCell = FieldFile | ByHeight | ByLabel
 Density = float | ByCell
 Quantity = Color | ByCell
 
@@ -193,7 +212,7 @@ class BoxSection:
         where left out. `auto`: what fits the pictures.
     resolution: Cells along x, y and z; left out: those of the file; `auto`: cubes two pixels
         wide, for which the box may grow, but not along its period.
-    up: The axis along which a `ground` and rings count, and which `export --up` turns.
+    up: The axis along which `heights`, a `ground` and rings count, and which `export --up` turns.
     periodic: The axes, one or two, along which the volume repeats without end, as `[x, z]`
         ([E2.15](theory.md#2-the-forward-model)). Lights are directional, ambient or maps; the
         diffusion is `p1` by the scheme `conservative`, or none.

@@ -68,6 +68,19 @@ def test_gray_fields_take_the_colors_of_constants(load: Load, tmp_path: Path):
         assert np.allclose(medium.sigma_a[color], (color + 1) * (1 - values), atol=1e-6)
 
 
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_values_by_height_are_linear_between_them_and_even_beyond(load: Load, up: str) -> None:
+    """A ramp that ends within the box, of one number and of colors."""
+    gas = {"heights": [-0.25, 0.25], "values": [[1, 2, 3], 1]}
+    density = {"heights": [-9, 9], "values": [0, 18]}
+    medium = load(volume((), density=density, sigma_a=gas, up=up), dtype=torch.float64).volume
+    place = medium.grid.centers(medium.density)["zyx".index(up)]
+    torch.testing.assert_close(medium.density, (place + 9).expand(SHAPE))
+    part = (0.5 + 2 * place).clamp(0, 1)
+    expected = torch.stack([top + (1 - top) * part for top in (1, 2, 3)]).expand(3, *SHAPE)
+    torch.testing.assert_close(medium.sigma_a, expected)
+
+
 def test_values_by_label_are_those_of_fields(read: Read, tmp_path: Path) -> None:
     """A table of optical properties, of whose rows each cell's label picks one."""
     labels = np.random.default_rng(3).integers(0, 3, SHAPE)

@@ -20,13 +20,16 @@ RING = "views={ring: {count: 3, radius: 3, fov: 30, resolution: [8, 6]}"
 SCENES = f"""
 volume.g=.nan => volume.g: expected a finite number
 volume.g=2 => -D volume.g=2: volume.g: must be below 1, found 2
-volume.density=[1, 2, 3] => {{file: ...}} or {{labels: ...}}, found a list of 3
+volume.density=[1, 2, 3] => {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found a list of 3
 volume.density={{constant: -1}} => volume.density.constant: must be at least 0
 volume.density={{constant: 1, file: a.npz}} => volume.density.constant: unknown key
 volume.density={{file: 3}} => density.file: expected a file, found 3 (put it in quotes)
 volume.density={{file: "a\\0"}} => volume.density.file: expected text that can be printed
 volume.density={{file: {"n" * 5000}}} => -D volume.density={{file: nnn
-volume.sigma_a=[1, 2] => [r, g, b], {{file: ...}} or {{labels: ...}}, found a list
+volume.sigma_a=[1, 2] => [r, g, b], {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found a list
+volume.density={{heights: [0, 0], values: [1, 2]}} => heights: must go up from one to the next
+volume.density={{heights: [0, 1], values: [1]}} => density.values: expected one for each height, 2
+volume.density={{heights: [0], values: [-1]}} => volume.density.values: must be at least 0
 volume.density={{labels: two.npz, table: [1, 2]}} => density.table: expected one for each label, 3
 volume.density={{labels: two.npz, table: [1, 2, -3]}} => volume.density.table: must be at least 0
 volume.density={{labels: two.npz, table: [1, 2, [1, 2, 3]]}} => expected numbers: colors
