@@ -17,7 +17,7 @@ from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.reconstruct.recording import Recording, Replays
+from ddrecon.reconstruct.recording import Record, Recording, Replays
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of
 
@@ -109,15 +109,20 @@ def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene: Scen
     render = replace(ball_scene.render, tolerance=0)
     whole, resumed = (Reconstruction(replace(ball_scene, render=render)) for _ in range(2))
 
+    recorded = list[Reconstruction]()
+
     def advance(run: Reconstruction, count: int) -> None:
-        (frame,) = run.frames
+        def new_recorder() -> Record:
+            recorded.append(run)
+            return record
+
         for _ in range(count):
-            frame.replays.new_recorder = lambda: record
+            run.frames[0].replays.new_recorder = new_recorder
             run.step()
 
     advance(whole, 3)
     resumed.restore(copy.deepcopy(whole.state()))
     for run in (whole, resumed):
-        advance(run, 2)
-        assert run.frames[0].replays.recording is not None
+        advance(run, 1)
+        assert run in recorded
     assert torch.equal(whole.parameters[0].value, resumed.parameters[0].value)
