@@ -25,8 +25,8 @@ from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
-from ddrecon.progress import Progress
-from ddrecon.reconstruct.gradients import share_pictures
+from ddrecon.ranks import sum_over_ranks
+from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -188,7 +188,7 @@ class Uncertainty(Job):
                 numbers[name] = _with_deviation(value, torch.cat(errors))
         return numbers
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes deviations, as volumes and as a page, and tells `uncertainty.json`."""
         fields, numbers, path = self.fields(), self.numbers(), self.path
         (path / "volumes").mkdir(exist_ok=True)
@@ -214,14 +214,17 @@ class Uncertainty(Job):
         lines = [_field_text(name, field) for name, field in record["fields"].items()]
         rows = [(n, f"{x['value']:.5g} +- {x['deviation']:.2g}") for n, x in numbers.items()]
         scene = self.run.current_scene()
-        smoke = {name: value.cpu() for name, value in fields_of(scene).items()}
-        off = {f"deviation of {n}": f.deviation for n, f in fields.items() if f.parameter.is_field}
-        shown = next(iter(off), "density")
+        shown = {
+            f"deviation of {n}": f.deviation for n, f in fields.items() if kind_of(n).is_cellwise
+        }
+        first = next(iter(shown), "density")
+        shown = {name: value.cpu() for name, value in fields_of(scene).items()} | shown
+        cells = [(name, "result", value, None) for name, value in shown.items()]
         write_page(
             path / "report.html",
             title=f"ddrecon: how sure a run is ({path.absolute().name})",
             lead=f"{lead}.",
-            volume=describe_fields(scene, {"result": smoke | off}, lines, shown),
+            volume=describe_fields(scene, cells, lines, first),
             numbers={"heading": "Numbers", "head": ("", ""), "rows": rows, "text": ASSUMED},
         )
         return record, [lead, *lines, *(f"{name}: {text}" for name, text in rows), ASSUMED]
@@ -246,12 +249,18 @@ class Uncertainty(Job):
 
 def photograph(scene: Scene, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The pictures [3, h, w] of `scene` with `values`, by name."""
+    names = [view.name for view in scene.views]
+    rendered = own_views(scene, names)
     with torch.no_grad():
         world = with_values(scene, values)
         light_field = solve_light(world, SolveMemory())
-        return share_pictures(
-            scene, lambda view: view_picture(light_field, world, world.view(view.name))
-        )
+        pictures = [
+            view_picture(light_field, world, world.view(view.name))
+            if view.name in rendered
+            else scene.volume.density.new_zeros(3, *view.camera.size)
+            for view in scene.views
+        ]
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def bring_closer(scene: Scene) -> Scene:
