@@ -81,7 +81,7 @@ def differentiate(
     del cut, inputs, sums
     through_light = follow_back(tensors, leaf_bars, list(values.values()))
     # The derivative is the sum of both ways.
-    direct = _add(direct, through_light)
+    _accumulate(direct, through_light, set())
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -173,14 +173,6 @@ def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added:
             added.add(i)
 
 
-def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Entry by entry; None is zero."""
-    return [
-        total if addend is None else addend if total is None else total + addend
-        for total, addend in zip(sums, more, strict=True)
-    ]
-
-
 def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
     """`record` with leaves in place of tensors that have a graph; both are added to the lists.
 
@@ -222,19 +214,6 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     # Ranks take turns, largest views first, so that all end at about one time.
     rank_names = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
     return [name for name in names if name in rank_names]
-
-
-def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[str, Tensor]:
-    """Pictures [3, h, w] of all views, by name, on all ranks, each by `picture_of` on one."""
-    names = [view.name for view in scene.views]
-    rendered = own_views(scene, names)
-    pictures = [
-        picture_of(view)
-        if view.name in rendered
-        else scene.volume.density.new_zeros(3, *view.camera.size)
-        for view in scene.views
-    ]
-    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def sum_present(tensors: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:

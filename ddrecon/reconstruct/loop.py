@@ -108,7 +108,7 @@ class Reconstruction:
         weight = self.search.weight
         is_accepted = self.search.judge(candidate, objective)
         self._put(self.search.values)
-        stage = self.schedule.stage
+        stage, number = self.schedule.stage, self.schedule.progress.stage
         self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
         is_over = self.schedule.is_over(self.iteration + 1)
         fraction = self.problem.settings.keep_start
@@ -123,8 +123,10 @@ class Reconstruction:
             frame.add_row(evaluation, weight, seconds, is_accepted, is_test_due)
             for frame, evaluation in zip(self.frames, evaluations, strict=True)
         ]
-        if self.schedule.stage != stage:
+        if self.schedule.progress.stage != number:
             self._pass_trial(is_over=stage.is_trial)
+            if stage.is_trial or self.schedule.stage.level == stage.level:
+                self.search.pairs = []  # the metric of what is there finds other directions
             self._enter_stage()
         return rows
 
@@ -152,8 +154,8 @@ class Reconstruction:
 
         Both are parts of that of the pictures, as the loss compares them.
         """
-        unit = self.problem.power or 1.0
-        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
+        residual = math.sqrt(self.total.data_loss / self.problem.unit)
+        noise = math.sqrt(self.noise_loss)
         ending: dict[str, Any] = self.schedule.ending(self.iteration)
         ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
         return ending | {"residual": residual, "noise": noise}
@@ -193,7 +195,6 @@ class Reconstruction:
         loss, values = self.rival
         if is_over and self.search.objective.loss > tuning.BETTER * loss:
             self._put(values)
-            self.search.pairs = []
         self.rival = math.inf, {}
         if self.schedule.stage.is_trial:
             self.rival = self.search.objective.loss, self.search.values
@@ -202,7 +203,6 @@ class Reconstruction:
                 for key, value in self.search.values.items()
             }
             self._put(self._project(denser))
-            self.search.pairs = []
 
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""

@@ -61,11 +61,12 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
     lit = [p for p in visible if not (scene.lights and p.key == "emission" and len(visible) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
-    is_even = all(isinstance(light, AmbientLight) for light in scene.lights)
-    if is_empty and is_even and any(p.key == "density" for p in lit):
-        # The stage after the trial begins with the better of two volumes.
-        again = stages[:1] if len(stages) == 1 else []
-        stages = [stages[0], Stage(stages[0].level, is_trial=True), *stages[1:], *again]
+    if is_empty:
+        is_even = all(isinstance(light, AmbientLight) for light in scene.lights)
+        has_trial = is_even and any(p.key == "density" for p in lit)
+        trial = [Stage(stages[0].level, is_trial=True)] * has_trial
+        # The metric of the first stage is that of nothing: what is there takes its own.
+        stages = [stages[0], *trial, *(stages[1:] or stages)]
     return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages
 
 

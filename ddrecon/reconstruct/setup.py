@@ -40,6 +40,11 @@ class Problem:
     support: Support | None
     factors: Sequence[int]
 
+    @property
+    def unit(self) -> float:
+        """What losses are relative to: the power, unless all targets are black."""
+        return self.power or 1.0
+
     @staticmethod
     def of(scene: Scene, iterations: Iterations | None = None) -> Problem:
         """What `scene` asks for, in as many `iterations` as it says, or as given.

@@ -25,7 +25,8 @@ from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
-from ddrecon.reconstruct.gradients import share_pictures
+from ddrecon.ranks import sum_over_ranks
+from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -248,12 +249,18 @@ class Uncertainty(Job):
 
 def photograph(scene: Scene, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The pictures [3, h, w] of `scene` with `values`, by name."""
+    names = [view.name for view in scene.views]
+    rendered = own_views(scene, names)
     with torch.no_grad():
         world = with_values(scene, values)
         light_field = solve_light(world, SolveMemory())
-        return share_pictures(
-            scene, lambda view: view_picture(light_field, world, world.view(view.name))
-        )
+        pictures = [
+            view_picture(light_field, world, world.view(view.name))
+            if view.name in rendered
+            else scene.volume.density.new_zeros(3, *view.camera.size)
+            for view in scene.views
+        ]
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def bring_closer(scene: Scene) -> Scene:

@@ -89,7 +89,9 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
     succeed("export", "scene.yaml", "-o", "by_cell.npz", *by_cell)
     assert field_names(Path("by_cell.npz")) == ["density", "sigma_t", "albedo"]
     sought = "optimize.parameters.albedo={init: 0.8, field: true}"
-    succeed("optimize", "scene.yaml", "-o", "field", "-q", "-D", sought)
+    # From nothing, density comes first.
+    start = "optimize.parameters.density={init: 0.5}"
+    succeed("optimize", "scene.yaml", "-o", "field", "-q", "-D", sought, "-D", start)
     assert "sigma_t 6.5 5.5 4.5" in succeed("export", "field", "-o", "field.npz").stdout
     assert field_names(Path("field.npz")) == ["density", "albedo"]
     told = refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1]

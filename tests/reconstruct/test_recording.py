@@ -81,7 +81,7 @@ def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
     objective = replays.differentiate(values, compared, memory)
     assert not objective.residuals
     assert_same(objective, differentiate_plainly(scene, values, "one"))
-    assert len(compared.metrics["psnr"]) == 1
+    assert len(compared.psnrs) == 1
 
 
 def test_what_cannot_be_recorded_runs_plainly(
