@@ -211,10 +211,10 @@ def run(
             arrays[f"errors_{at}"] = judge(truth, folder, density, times, views)
             arrays[f"density_{at}"] = density
         np.savez_compressed(path, seconds=seconds, losses=losses, **arrays)
-    kept = np.load(path)
-    at = [int(key.removeprefix("density_")) for key in kept if key.startswith("density_")]
-    densities, errors = ({i: kept[f"{key}_{i}"] for i in at} for key in ("density", "errors"))
-    return Run(times, tv, name, kept["seconds"], kept["losses"], densities, errors)
+    stored = np.load(path)
+    at = [int(key.removeprefix("density_")) for key in stored if key.startswith("density_")]
+    densities, errors = ({i: stored[f"{key}_{i}"] for i in at} for key in ("density", "errors"))
+    return Run(times, tv, name, stored["seconds"], stored["losses"], densities, errors)
 
 
 def paces(folder: Path, is_kept: bool) -> dict[str, float]:

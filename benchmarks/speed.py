@@ -105,7 +105,7 @@ def print_rounds() -> None:
     for overrides in MEDIA.values():
         scene = load_scene(PLUME, overrides=[*truth, *overrides])
         settings = [replace(scene.diffusion, transport_rounds=n, degree=d) for n, d in ROUNDS]
-        columns.append([seconds(replace(scene, diffusion=each)) for each in settings])
+        columns.append([seconds(replace(scene, diffusion=diffusion)) for diffusion in settings])
     print_header("n", "degree", *MEDIA)
     for index, (rounds, degree) in enumerate(ROUNDS):
         ratios = (f"{column[index] / column[0]:.1f}" for column in columns)

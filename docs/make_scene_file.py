@@ -152,7 +152,7 @@ def _joined(entries: Iterable[tuple[str, str]]) -> list[str]:
     names: dict[str, list[str]] = {}
     for name, text in entries:
         names.setdefault(text, []).append(f"`{name}`")
-    return [f"| {', '.join(each)} | {text} |" for text, each in names.items()]
+    return [f"| {', '.join(group)} | {text} |" for text, group in names.items()]
 
 
 def _takes(hint: Any, field: Field[Any]) -> str:
@@ -225,13 +225,13 @@ def _define(record: type, defined: dict[str, Any]) -> dict[str, Any]:
 
 
 def _any_of(hints: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
-    each = [_one(hint, limits, defined) for hint in hints]
+    schemas = [_one(hint, limits, defined) for hint in hints]
     if settings.FieldFile in hints and float in hints:
         number = _one(float, limits, defined)
-        each.append(
+        schemas.append(
             {"type": "object", "properties": {"constant": number}, "required": ["constant"]}
         )
-    return each[0] if len(each) == 1 else {"anyOf": each}
+    return schemas[0] if len(schemas) == 1 else {"anyOf": schemas}
 
 
 def _one(hint: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.autograd.graph import saved_tensors_hooks
 
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
@@ -193,6 +194,20 @@ def assert_derivatives(
             for step in (1e-5, -1e-5)
         )
     assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
+
+
+def count_kept(function: Callable[[], Tensor], least: int) -> int:
+    """How many tensors of `least` numbers or more `function` keeps for its backward pass."""
+    kept = dict[int, Tensor]()
+
+    def note(tensor: Tensor) -> Tensor:
+        if tensor.numel() >= least:
+            kept[tensor.data_ptr()] = tensor.detach()
+        return tensor
+
+    with saved_tensors_hooks(note, lambda tensor: tensor):
+        assert function().requires_grad
+    return len(kept)
 
 
 def data_matrix(

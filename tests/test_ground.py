@@ -13,6 +13,7 @@ from media import (
     UPPER,
     assert_derivatives,
     half_empty,
+    light_of,
     make_camera,
     make_scene,
     random_values,
@@ -30,8 +31,10 @@ from ddrecon.light.lights import (
     BeamLight,
     DirectionalLight,
     EnvironmentLight,
+    Light,
     PointLight,
 )
+from ddrecon.light.sky import decompose_map
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
@@ -138,6 +141,30 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     taken = 1.9 * float(-torch.expm1(-depth / 0.2 * across / 0.6).mean())
     total = 3 * cosine / math.pi * 1.2 * taken
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
+
+
+def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights() -> None:
+    """Those that are less bright than its mean take away: 7 % are left of texels."""
+    around = (torch.arange(16, dtype=torch.float64) + 0.5) * (2 * math.pi / 16)
+    sky = light_of((1 + 0.9 * around.sin()).expand(1, 8, 16), directions=24)
+    mean, lights = decompose_map(sky)
+
+    def taken(*lights: Light) -> Tensor:
+        black = {"sigma_a": (3.0,), "sigma_s": (0.0,), "directional": None}
+        seen = []
+        for density in (torch.zeros(SHAPE), torch.ones(SHAPE)):
+            scene = on_ground(density.double(), **black)
+            settings = replace(scene.render, background=False)
+            seen.append(render(replace(scene, lights=[*lights], render=settings)))
+        return seen[0] - seen[1]
+
+    pairs = [*zip(lights.travel.flip(-1), lights.irradiance, strict=True)]
+    more, less = (
+        taken(*(DirectionalLight(way, (sign * power).clamp(min=0)) for way, power in pairs))
+        for sign in (1, -1)
+    )
+    known = taken(mean) + more - less
+    assert float((taken(sky) - known).norm()) < 0.1 * float(known.norm())
 
 
 @pytest.mark.slow

@@ -178,6 +178,14 @@ def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
     torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-10, atol=0)
 
 
+def test_a_glowing_layer_lights_the_ground_below_it():
+    """By 2 pi j times its height of 1; the ground shows half of that over pi."""
+    thin = {"sigma_a": (1e-6,), "sigma_s": (0.0,), "directional": None, "has_ground": True}
+    scene = repeated(even(4, 5, 3), emission=tensor(1.0), **thin)
+    ground = render(scene) - render(replace(scene, ground=None))
+    torch.testing.assert_close(ground, torch.ones_like(ground), rtol=0.15, atol=0)
+
+
 def test_a_period_is_the_middle_of_many():
     """Light that is scattered once; of seven copies in a box, the outer ones are far off."""
     use_engine("torch")

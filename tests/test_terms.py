@@ -126,8 +126,8 @@ def test_a_thick_face_is_told_by_what_it_costs() -> None:
         (0.99, 0.9, None),
     ):
         medium = f"volume.sigma_a={(1 - albedo) * 1.5 / size}", f"volume.g={g}"
-        found = doubts(*cells, *medium, f"volume.sigma_s={albedo * 1.5 / size}")
-        assert words in found[0] if words else found == []
+        lines = doubts(*cells, *medium, f"volume.sigma_s={albedo * 1.5 / size}")
+        assert words in lines[0] if words else lines == []
 
 
 def test_a_light_below_the_ground() -> None:

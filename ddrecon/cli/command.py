@@ -183,11 +183,13 @@ def _run(function: Callable[..., None], is_shared: bool, values: dict[str, Any])
     """Calls `function` in a session; on the first rank alone where ranks do not share its work."""
     from ddrecon.cli.session import Session
     from ddrecon.io.files.folders import require_folder_of
+    from ddrecon.progress import be_quiet
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = {field.name for field in fields(Session)} & values.keys()
     said = {name: values.pop(name) for name in common}
     session = Session(**{name: value for name, value in said.items() if value is not None})
+    be_quiet(session.quiet)
     with show_warnings():
         if session.report is not None:
             require_folder_of(session.report)

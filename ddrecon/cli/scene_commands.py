@@ -35,7 +35,7 @@ def check(session: Session, source: Path) -> None:
     if scene_file.tree.frames is not None:
         require_frames(scene_file)
     scenes = map(session.build, each_frame(scene_file))
-    with tell("reading pictures, and looking at what they show", session.is_quiet):
+    with tell("reading pictures, and looking at what they show"):
         first = next(scenes)
         supports = supports_of(chain([first], scenes))
         report, lines = describe(first, supports)
@@ -132,7 +132,7 @@ def _render(
                 require_free_files([chosen.movie], may_exist=session.overwrite)
                 require_movie(chosen.movie, views, output)
             folder.clear([scene_file.path, *referenced_files(scene_file)])
-        return render_to_folder(scene, views, output, chosen, session.progress)
+        return render_to_folder(scene, views, output, chosen)
 
 
 @command(
@@ -176,15 +176,14 @@ def optimize(
     from ddrecon.run.job import work
     from ddrecon.run.run_folder import Run
 
-    quiet = session.is_quiet
     with session.claim(RUN) as folder:
-        with tell("reading pictures and building the scene", quiet):
+        with tell("reading pictures and building the scene"):
             if scene_file.tree.diffusion.is_conservative_p1:
                 dtype, place = getattr(torch, session.dtype), session.start()
                 name_kernels(torch.empty(0, dtype=dtype, device=place))
             scene, environment = session.build(scene_file), session.environment()
-        job = Run(scene, scene_file, environment, preview_every, quiet)
-        told = work(job, folder, is_resumed=session.resume, is_quiet=quiet)
+        job = Run(scene, scene_file, environment, preview_every)
+        told = work(job, folder, session.resume)
     session.show(*told)
 
 
@@ -202,8 +201,8 @@ def _optimize_film(
     from ddrecon.film.report import drive_film
     from ddrecon.ranks import alone, from_first, is_first
 
-    environment, quiet = session.environment(), session.is_quiet
-    film = Film(scene_file, session.output, session.build, environment, preview_every, quiet)
+    environment = session.environment()
+    film = Film(scene_file, session.output, session.build, environment, preview_every)
     numbers = share_out(choose_frames(film.frames.numbers, frames))
     if is_first():
         choice = {"overwrite": session.overwrite, "resume": session.resume}
@@ -231,5 +230,5 @@ def uncertainty(session: Session, source: Path, experiments: int) -> None:
         )
     job = Uncertainty(run, session.seed, experiments)
     with session.claim(UNCERTAINTY) as folder:
-        told = work(job, folder, is_resumed=session.resume, is_quiet=session.is_quiet)
+        told = work(job, folder, session.resume)
     session.show(*told)

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder, claim_folder
-from ddrecon.progress import Progress, show_progress
+from ddrecon.progress import be_quiet, show_progress
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT, require_no_film
 from ddrecon.scene_file.load import SceneFile, read_scene
@@ -84,7 +83,9 @@ class Session:
         join_ranks(has_gpu)
         log = logging.getLogger(LOG)
         log.handlers = [_AboveBars()]
-        log.setLevel(logging.ERROR if self.is_quiet else logging.INFO)
+        is_quiet = self.quiet or not is_first()  # of several ranks the first alone shows progress
+        be_quiet(is_quiet)
+        log.setLevel(logging.ERROR if is_quiet else logging.INFO)
         use_engine(self.engine or current_engine())
         self.place = torch.device("cuda" if has_gpu else "cpu")
         if has_gpu and rank_count() > 1:
@@ -102,11 +103,6 @@ class Session:
         torch.set_num_threads(self.threads)
         torch.manual_seed(self.seed)
         return self.place
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no progress is shown; of several ranks the first alone shows it."""
-        return self.quiet or not is_first()
 
     def with_override(self, override: str, option: str) -> Session:
         """The same session with one more override of the scene file, which an `option` says."""
@@ -152,10 +148,7 @@ class Session:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))
 
-    @property
-    def progress(self) -> Progress:
-        """What shows progress on stderr, unless quiet."""
-        return partial(show_progress, is_quiet=self.is_quiet)
+    progress = staticmethod(show_progress)
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""

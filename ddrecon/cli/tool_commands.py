@@ -136,7 +136,7 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
         raise UsageError(f"-o {file}: unknown format {kind!r}; known: {', '.join(suffixes)}")
     from ddrecon.reference.exchange import export_scene
     from ddrecon.run.run_folder import LENGTHS, fields_to_export
-    from ddrecon.scene_file.transforms import export_transforms
+    from ddrecon.scene_file.camera_files import export_transforms
     from ddrecon.uncertainty.experiments import volumes_in
 
     volumes = tuple(volume for path in source for volume in volumes_in(path) or [path])

@@ -54,7 +54,7 @@ class DiffusionProblem:
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
         if is_fused() and isinstance(self.closure, Closure) and self.closure.name == "geometric":
-            from ddrecon.diffusion.fused.closure import close_medium
+            from ddrecon.diffusion.fused.cells import close_medium
 
             return close_medium(self.medium)
         return recompute(lambda: self.closure(self.medium.transport_extinction))
@@ -69,7 +69,7 @@ class DiffusionProblem:
         """A and the right side of E2.7."""
         medium, diffusion, (mean, first) = self.medium, self.diffusion, self._source
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import assemble_system
+            from ddrecon.diffusion.fused.cells import assemble_system
 
             *matrix, right = assemble_system(medium, diffusion, mean, first, self.outside)
         else:
@@ -92,7 +92,7 @@ class DiffusionProblem:
         fluxes = [moments for moments in (self._source[1], more) if moments is not None]
         first = reduce(torch.add, fluxes) if fluxes else None
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import find_flux
+            from ddrecon.diffusion.fused.cells import find_flux
 
             return find_flux(self.medium, self.diffusion, mean, first, self.outside, before)
         faces = self._find_flow(first, mean)
@@ -109,7 +109,7 @@ class DiffusionProblem:
         if flux is None:
             return right + source
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import spread_flux
+            from ddrecon.diffusion.fused.cells import spread_flux
 
             return spread_flux(self.medium, self.diffusion, flux, (right, source))
         return right + (source - self._spread(flux))

@@ -37,7 +37,7 @@ from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.progress import Progress, say
+from ddrecon.progress import say
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
@@ -51,7 +51,7 @@ from ddrecon.run.job import (
     work,
 )
 from ddrecon.run.report import list_numbers
-from ddrecon.run.result import RESULT, plain, poses_of, put_values
+from ddrecon.run.result import RESULT, poses_of, put_values
 from ddrecon.run.run_folder import (
     LENGTHS,
     LOG,
@@ -62,9 +62,9 @@ from ddrecon.run.run_folder import (
     field_key,
     fields_to_export,
     read_log,
+    store_value,
     volume_file,
     write_scene,
-    write_values,
     write_volume,
 )
 from ddrecon.scene import Scene
@@ -104,7 +104,6 @@ class Film:
     build: Callable[[SceneFile], Scene]
     environment: dict[str, Any] = field(default_factory=dict)
     preview_every: int | None = None
-    is_quiet: bool = True
     shared: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -144,8 +143,8 @@ class Film:
 
         The others wait, and say so, but for those that are to begin anew.
         """
-        tell = partial(say, is_quiet=self.is_quiet) if resume else None
-        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=tell)
+        waiting = say if resume else None
+        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=waiting)
 
     def scene_of(self, number: int) -> SceneFile:
         """The scene of the frame `number`, with what is shared fixed.
@@ -224,22 +223,17 @@ class Calibration(Iterations):
     def begin(self, folder: Folder, is_resumed: bool) -> None:
         """Nothing is to be made, nor to go."""
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes the volumes of these frames and what they share; its checkpoints go."""
         film, together = self.film, self.run
-        scene, values = together.current_scene(), dict[str, Any]()
+        scene, names = together.current_scene(), [p.name for p in together.shared]
         for number, frame in zip(self.numbers, together.frames, strict=True):
             for p in frame.parameters:
                 if p.is_field:
                     grid = frame.problem.scene.volume.grid
                     write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
-        poses = poses_of(scene, [p.name for p in together.shared])
-        for p in together.shared:
-            value = p.value.detach()
-            values[p.name] = poses.get(p.name) or plain(value)
-            if value.ndim >= 3:
-                stem, grid = film.path / f"shared.{p.name}", scene.volume.grid
-                values[p.name] = {"file": write_values(stem, p.name, value, grid, is_map=True)}
+        values = {name: store_value(film.path, scene, name) for name in names}
+        values |= poses_of(scene, names)
         numbers = list_numbers(together.shared, together.problem.scene, scene)
         texts = {name: text for name, _, text in numbers}
         content = {"frames": self.numbers, "values": values, "texts": texts}
@@ -331,7 +325,7 @@ def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
             job = Calibration(film, spread_out(film.frames.numbers, count))
             if job.run.shared:
                 is_resumed = has_checkpoint(film.path / CHECKPOINTS)
-                work(job, folder, is_resumed=is_resumed, is_quiet=film.is_quiet)
+                work(job, folder, is_resumed)
         film.shared = read_shared(shared) if shared.is_file() else {}
     failures = list[DdreconError]()
     for number in numbers:
@@ -354,9 +348,9 @@ def _drive_frame(film: Film, number: int) -> None:
         with claim_folder(path, RUN, overwrite=True) as folder:
             is_resumed = has_checkpoint(path / CHECKPOINTS)
             scene_file = read_scene(path / SCENE) if is_resumed else film.scene_of(number)
-            scene, options = film.build(scene_file), (film.preview_every, film.is_quiet)
-            job = Run(scene, scene_file, film.environment, *options, f"frame {number}")
-            work(job, folder, is_resumed=is_resumed, is_quiet=film.is_quiet)
+            scene, title = film.build(scene_file), f"frame {number}"
+            job = Run(scene, scene_file, film.environment, film.preview_every, title)
+            work(job, folder, is_resumed)
             (path / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(path, VELOCITY).is_file():
         film.write_velocity(number)
@@ -438,8 +432,8 @@ def read_shared(path: Path) -> dict[str, Any]:
         raise FormatError(path, "has no 'values'; expected the shared.json of a film")
     values = content["values"]
     for name, value in values.items():
-        if isinstance(value, dict) and "file" in value:
-            values[name] = str((path.parent / value["file"]).absolute())
+        if isinstance(value, str):
+            values[name] = str((path.parent / value).absolute())
     return content
 
 

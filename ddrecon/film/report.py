@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from statistics import mean
 from time import monotonic
 from typing import Any
@@ -18,9 +17,8 @@ from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import pixels, shrink
-from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.job import Told
-from ddrecon.run.report import psnr_text
+from ddrecon.run.report import describe_fields, psnr_text
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import REPORT, SUMMARY
 from ddrecon.scene_file.build_views import remove_pictures
@@ -121,13 +119,11 @@ def _volumes(film: Film, numbers: Sequence[int]) -> dict[str, Any]:
     """The fields of the frames `numbers`, and what stands around them by the last one."""
     last = remove_pictures(read_scene(film.of(numbers[-1]) / RESULT), None)
     fields = [
-        Shown(name, "result", value, find_white_value(value), number)
+        (name, "result", value, number)
         for number in numbers
         for name, value in fields_in(film.of(number), film.optimized).items()
     ]
-    whites = {f.name: max(g.white for g in fields if g.name == f.name) for f in fields}
-    scaled = [replace(field, white=whites[field.name]) for field in fields]
-    return describe_volume(scaled, describe_world(film.grid, film.build(last)), (), fields[0].name)
+    return describe_fields(film.build(last), fields, (), fields[0][0])
 
 
 def _figures(

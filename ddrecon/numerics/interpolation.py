@@ -68,11 +68,10 @@ def _sample(values: Tensor, points: Tensor) -> Tensor:
             values, points, mode="bilinear", padding_mode="border", align_corners=False
         )
     # Corner by corner: along each axis the center before a point, and the next one.
-    sizes, shape = values.shape[2:], points.shape[1:-1]
     flat = values.flatten(2).mT.flatten(0, 1)
-    slices = torch.arange(len(values), device=points.device).view(-1, *[1] * len(shape))
+    slices = torch.arange(len(values), device=points.device).view(-1, *[1] * (points.ndim - 2))
     corners = [(slices.expand(points.shape[:-1]), torch.ones_like(points[..., 0]))]
-    for size, coordinate in zip(sizes, points.unbind(-1)[::-1], strict=True):
+    for size, coordinate in zip(values.shape[2:], points.unbind(-1)[::-1], strict=True):
         center, a = split_place(coordinate, size)
         cells = [(center.long() + side).clamp(0, size - 1) for side in (0, 1)]
         corners = [
@@ -82,7 +81,7 @@ def _sample(values: Tensor, points: Tensor) -> Tensor:
         ]
     columns = zip(*corners, strict=True)
     rows, weights = (torch.stack(column, -1).flatten(0, -2) for column in columns)
-    return weigh_rows(flat, rows, weights).unflatten(0, (len(values), -1)).mT.unflatten(2, shape)
+    return weigh_rows(flat, rows, weights).unflatten(0, points.shape[:-1]).movedim(-1, 1)
 
 
 def weigh_rows(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.kernels.graphs import GraphRecorder
 from ddrecon.numerics.remember import without_reads
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct.gradients import (
@@ -47,6 +46,33 @@ class Program:
 
     result: Any
     replay: Callable[[], object]
+
+
+class GraphRecorder:
+    """Records computations on a GPU as CUDA graphs, which a processor replays by one launch each.
+
+    They run in turn and share their memory, which goes with the last of them. A computation can be
+    recorded if Python reads none of its numbers and hands it none.
+    """
+
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
+
+    def __call__(self, computation: Callable[[], Any]) -> tuple[Any, Callable[[], object]]:
+        """What `computation` returns, not computed yet, and a function that computes it, in place.
+
+        Each replay overwrites its tensors. Raises RuntimeError where CUDA refuses to record.
+        """
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        # Constants, workspaces of libraries and modules of kernels are made in a run before.
+        with torch.cuda.stream(stream):
+            computation()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+            result = computation()
+        return result, graph.replay
 
 
 class Recording:

@@ -66,10 +66,11 @@ class Search:
 
     `values` are the last candidate accepted, none at first, and `objective` what was found there.
     The prior counts by `weight`. `pairs` are the last accepted moves and the changes of both
-    derivatives. The next `candidate` is `step` times `direction` away, within bounds; along that
-    the loss falls by `slope`, and up to there by `promise`. `is_stuck` where no step helps.
-    `scales` are how long the metric is, by group of values, as the last pair had it. `gains` are
-    what the loss could still fall by, as part of it, at the last values.
+    derivatives. The next `candidate` is `step` times `direction` away, within bounds, which is a
+    `move`. As far as derivatives tell, the loss falls by `slope` along that direction and by
+    `promise` in that move; `is_stuck` where no step helps. `scales` are how long the metric is, by
+    group of values, as the last pair had it. `gains` are what the loss could still fall by, as part
+    of it, at the last values.
     """
 
     space: Space
@@ -79,6 +80,7 @@ class Search:
     pairs: list[tuple[Values, Values, Values]] = field(default_factory=list)
     direction: Values = field(default_factory=dict)
     candidate: Values = field(default_factory=dict)
+    move: Values = field(default_factory=dict)
     slope: float = 0.0
     promise: float = 0.0
     step: float = 1.0
@@ -112,12 +114,12 @@ class Search:
             if not loss <= self.loss + tuning.SUFFICIENT * self.promise:
                 self._shorten(loss)
                 return False
-            old, move = self.objective, self._move_to(values)
+            old = self.objective
             changes = (
                 _combine(objective.gradients, old.gradients, -1),
                 _combine(objective.prior_gradients, old.prior_gradients, -1),
             )
-            self.pairs = [*self.pairs, (move, *changes)][-tuning.PAIRS :]
+            self.pairs = [*self.pairs, (self.move, *changes)][-tuning.PAIRS :]
         self.values, self.objective = values, objective
         self.aim()
         return True
@@ -150,12 +152,10 @@ class Search:
         """
         moved = {n: torch.add(v, self.direction[n], alpha=step) for n, v in self.values.items()}
         self.step, self.candidate = step, self.space.project(moved)
-        promise = _dot(self._move_to(self.candidate), self.objective.slopes(self.weight))
+        self.move = {name: value - self.values[name] for name, value in self.candidate.items()}
+        promise = _dot(self.move, self.objective.slopes(self.weight))
         self.promise, *others = from_first(torch.stack([promise, *numbers]).tolist())
         return others
-
-    def _move_to(self, values: Values) -> Values:
-        return {name: value - self.values[name] for name, value in values.items()}
 
     def _shorten(self, loss: float) -> None:
         """Shortens the step to where the parabola through what is known is lowest."""
@@ -195,9 +195,8 @@ class Search:
             group = self.space.group(name)
             length = self.scales.get(group, 1.0)
             if group in ratios:
-                ratio = ratios[group]
-                is_length = (ratio > 0) & (ratio < math.inf)
-                result[name] = value * torch.where(is_length, ratio, length).to(value)
+                measured = torch.where(ratios[group] > 0, ratios[group], length)
+                result[name] = value * (measured if value.ndim else measured.to(value))
             else:
                 result[name] = value * length
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):

@@ -13,7 +13,6 @@ import os
 import warnings
 import zipfile
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Protocol
@@ -25,7 +24,7 @@ from ddrecon.errors import DataWarning, DivergenceError, FormatError, RanksError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.io.files.folders import Folder
-from ddrecon.progress import BAR, Progress, bar_settings, show_progress, tell
+from ddrecon.progress import BAR, bar_settings, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
@@ -82,11 +81,11 @@ class Job(Protocol):
         if not is_resumed:
             folder.clear()
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes what was found to the folder, and tells it."""
 
 
-def work(job: Job, folder: Folder | None, *, is_resumed: bool, is_quiet: bool) -> Told:
+def work(job: Job, folder: Folder | None, is_resumed: bool) -> Told:
     """What `job` tells after the iterations that are left, from what its `folder` has on.
 
     A rank whose folder is None does its part, writes nothing and has nothing to tell. Raises
@@ -104,27 +103,27 @@ def work(job: Job, folder: Folder | None, *, is_resumed: bool, is_quiet: bool) -
                 os.replace(loaded, place / LAST)  # what was damaged after it goes
     if folder is not None:
         job.begin(folder, is_resumed)
-    drive(job, place, is_resumed=is_resumed, is_quiet=is_quiet)
+    drive(job, place, is_resumed)
     if folder is None:
         return {}, []
     leave_ranks()  # what is left the first rank does by itself
 
     try:
-        with tell(f"{job.title}: writing what was found, with its report", is_quiet):
-            return job.finish(partial(show_progress, is_quiet=is_quiet))
+        with tell(f"{job.title}: writing what was found, with its report"):
+            return job.finish()
     except KeyboardInterrupt:
         count_text = f"after {job.iteration} iterations"
         raise KeyboardInterrupt(f"{count_text}; write its results with --resume") from None
 
 
-def drive(job: Job, place: Path | None, *, is_resumed: bool, is_quiet: bool) -> None:
+def drive(job: Job, place: Path | None, is_resumed: bool = False) -> None:
     """Makes the iterations of `job` that are left; its checkpoints go to the folder `place`.
 
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
     before it is passed on. So do a divergence and the end of another rank; any other failure leaves
     the checkpoints written so far.
     """
-    form, settings = BAR if job.total else None, bar_settings(is_quiet)
+    form, settings = BAR if job.total else None, bar_settings()
     bar = tqdm(total=job.total, initial=job.iteration, desc=job.title, bar_format=form, **settings)
     saved, next_save = -1, 0.0
     if is_resumed:

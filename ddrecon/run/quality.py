@@ -24,7 +24,7 @@ from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
 from ddrecon.pictures.scales import COMPARED, LINEAR
-from ddrecon.progress import Progress
+from ddrecon.progress import show_progress
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes, target_of
@@ -75,33 +75,30 @@ class Findings:
         return [view for view in self.scene.views if view.image is not None]
 
 
-def find_results(run: Reconstruction, progress: Progress | None = None) -> Findings:
-    """The current result of `run`, rendered; with a `progress`, held-out views are registered."""
-    scene = run.current_scene()
-    shown = [view for view in scene.views if view.image is not None]
-    targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
+def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
+    """The current result of `run`, rendered; if it `is_last`, held-out views are registered."""
+    scene, sizes = run.current_scene(), response_sizes(run.parameters)
     images, quality = dict[str, Tensor](), dict[str, dict[str, Any]]()
+    findings = Findings(scene, _find_truths(run.problem.scene), images, quality)
+    shown = replace(scene, views=findings.seen)
+    targets = targets_of(shown, run.problem.loss, run.problem.noises)
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
-        for view in shown:
-            target, sizes = targets[view.name], response_sizes(run.parameters)
-            fitted = dict[str, Tensor]()
+        for view in show_progress(shown.views, "register") if is_last else shown.views:
+            target, fitted = targets[view.name], dict[str, Tensor]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
                 picture, fitted = fit_held_out(picture, view, target, sizes)
             images[view.name] = picture
-            quality[view.name] = {
+            told = quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
-        held_out = [view for view in shown if view.is_test]
-        for view in progress(held_out, "register") if progress and held_out else ():
-            target = targets[view.name]
-            registered = register(light_field, scene, view, target, response_sizes(run.parameters))
-            quality[view.name]["registered"] = registered
-    return Findings(scene, _find_truths(run.problem.scene), images, quality)
+            if is_last and view.is_test:
+                told["registered"] = register(light_field, scene, view, target, sizes)
+    return findings
 
 
 def _find_truths(scene: Scene) -> dict[str, Tensor]:

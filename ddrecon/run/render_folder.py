@@ -33,7 +33,7 @@ from ddrecon.losses import Target
 from ddrecon.medium.levels import resample
 from ddrecon.picture import view_components, view_matte, view_picture
 from ddrecon.pictures import srgb
-from ddrecon.progress import Progress
+from ddrecon.progress import show_progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.job import Told
@@ -121,9 +121,7 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
         load_for_file("imageio_ffmpeg", path)
 
 
-def render_to_folder(
-    scene: Scene, views: Sequence[View], folder: Path, choice: Choice, progress: Progress
-) -> Told:
+def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: Choice) -> Told:
     """Renders `views` of `scene` to `folder`, with `render.json`; the first rank alone tells."""
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
@@ -140,7 +138,7 @@ def render_to_folder(
             if is_first():
                 cells = forward_ad.unpack_dual(cells).primal
                 fluence = write_volume(folder, "fluence", cells, scene.volume.grid)
-        for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
+        for view, images, elapsed in _render_in_turns(light_field, world, views, names):
             if not is_first():
                 continue
             seconds[view.name] = elapsed
@@ -263,26 +261,22 @@ def _render_in_turns(
     scene: Scene,
     views: Sequence[View],
     names: Sequence[str],
-    progress: Progress,
 ) -> Iterator[tuple[View, dict[str, Tensor], float]]:
     """Each of `views`, its images by `names`, the ends of their files, and the seconds they took.
 
     With several ranks these are of a turn, in which each renders one view.
     """
     ranks, rank = rank_count(), own_rank()
-    for begin in progress(range(0, len(views), ranks), "render"):
+    for begin in show_progress(range(0, len(views), ranks), "render"):
         turn, start = views[begin : begin + ranks], perf_counter()
         images = dict[str, Tensor]()
         if rank < len(turn):
             images = _images(light_field, scene, scene.view(turn[rank].name), names)
         seconds = perf_counter() - start
         for place, view in enumerate(turn):
-            if ranks > 1:
-                nothing = view.camera.pose.new_zeros(3, *view.camera.size)
-                contributions = [images[name] if place == rank else nothing for name in names]
-                yield view, dict(zip(names, sum_over_ranks(contributions), strict=True)), seconds
-            else:
-                yield view, images, seconds
+            nothing = view.camera.pose.new_zeros(3, *view.camera.size)
+            shares = [images[name] if place == rank else nothing for name in names]
+            yield view, dict(zip(names, sum_over_ranks(shares), strict=True)), seconds
 
 
 def _images(

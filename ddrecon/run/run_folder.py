@@ -22,7 +22,7 @@ from ddrecon.io.files.folders import Folder
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import write_field
-from ddrecon.progress import Progress, say, tell
+from ddrecon.progress import say, tell
 from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support, support_text
@@ -86,9 +86,8 @@ class Iterations(Job):
 class Run(Iterations):
     """The job of reconstructing the `scene` of a `scene_file` in an `environment`.
 
-    Pictures are written each `preview_every` iterations, `frame` names a frame of a film; with
-    `is_quiet`, or of a frame, nothing is told. Raises SceneError for a scene that cannot be
-    reconstructed.
+    Pictures are written each `preview_every` iterations; a `frame` of a film, which this names,
+    says less. Raises SceneError for a scene that cannot be reconstructed.
     """
 
     def __init__(
@@ -97,19 +96,17 @@ class Run(Iterations):
         scene_file: SceneFile,
         environment: Mapping[str, Any],
         preview_every: int | None = None,
-        is_quiet: bool = True,
         frame: str = "",
     ):
-        self.is_silent = is_quiet or bool(frame)
         try:
-            with tell("looking at what the pictures show", self.is_silent):
+            with tell(f"{frame or 'optimize'}: looking at what the pictures show"):
                 run = Reconstruction(scene)
         except SceneError as error:
             problems = [f"{scene_file.path}: {problem}" for problem in error.problems]
             raise SceneError(problems) from None
         result_of = fingerprint(scene_file, scene.volume.density.dtype)
         super().__init__(run, frame or "optimize", result_of)
-        self.scene_file, self.environment = scene_file, environment
+        self.scene_file, self.environment, self.is_frame = scene_file, environment, bool(frame)
         self.preview_every, self.cells = preview_every, 0
         self.path: Path | None = None
         self.next_page = monotonic() + PAGE_SECONDS
@@ -131,7 +128,8 @@ class Run(Iterations):
         write_log(
             self.path / LOG, [r for r in read_log(self.path / LOG) if r.iteration <= self.iteration]
         )
-        say(loss_text(describe_loss(run.problem.settings, run.problem.train)), self.is_silent)
+        if not self.is_frame:
+            say(loss_text(describe_loss(run.problem.settings, run.problem.train)))
 
     def step(self) -> str:
         """Makes an iteration and its row of the log; how near its pictures are.
@@ -142,9 +140,8 @@ class Run(Iterations):
         if self.path is None:
             return ""
         write_log(self.path / LOG, [row], is_more=True)
-        if self.cells not in (0, row.cells):
-            text = f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}"
-            say(text, self.is_silent)
+        if self.cells not in (0, row.cells) and not self.is_frame:
+            say(f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}")
         self.cells = row.cells
         if self.preview_every and row.iteration % self.preview_every == 0:
             write_previews(self.path, find_results(self.run), f".{row.iteration:06d}")
@@ -163,15 +160,15 @@ class Run(Iterations):
             flush(self.path / LOG)
         return super().state()
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes volumes, parameters, result, pictures and report, and tells the summary."""
         assert self.path is not None
         run, path = self.run, self.path
-        findings = find_results(run, progress)
+        findings = find_results(run, is_last=True)
         scene, support = findings.scene, run.problem.support
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
-        values = {name: _store(path, scene, name) for name in stored}
+        values = {name: store_value(path, scene, name) for name in stored}
         dump_scene(describe_result(self.scene_file, scene, values), path / RESULT)
         write_json(path / "parameters.json", _list_parameters(path, scene, values))
         write_previews(path, findings, "")
@@ -296,11 +293,11 @@ def _list_parameters(folder: Path, scene: Scene, stored: Mapping[str, Any]) -> d
         if value.ndim < 3:
             parameters[name] = value.tolist()
         elif not kind_of(name).is_cellwise:
-            parameters[name] = stored.get(name) or _store(folder, scene, name)
+            parameters[name] = stored.get(name) or store_value(folder, scene, name)
     return parameters | poses_of(scene, parameters)
 
 
-def _store(folder: Path, scene: Scene, name: str) -> Any:
+def store_value(folder: Path, scene: Scene, name: str) -> Any:
     """The value of a variable as plain numbers, or where its file is, which is written here."""
     value = value_of(scene, name)
     if value.ndim < 3:

@@ -158,7 +158,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         rows = depths, twice, scattering.scale.view(1, -1)
         colors = max(row.shape[1] for row in rows)
         numbers = torch.cat([row.expand(-1, colors) for row in rows])
-        name = "transport/fused/steep.h", "Steep", 3
+        name = "transport/fused/gain.h", "Steep", 3
         return torch.stack(
             apply_cell(*name, numbers, extinction.field, scattering.field, *gradient)
         )
@@ -194,7 +194,7 @@ def cell_gradient(q: Tensor) -> Tensor:
     Half the difference of both neighbors; at the faces of the box, that to the one.
     """
     if is_fused():
-        from ddrecon.diffusion.fused.around import rises_fused
+        from ddrecon.diffusion.fused.cells import rises_fused
 
         return rises_fused(q)
     return torch.stack(

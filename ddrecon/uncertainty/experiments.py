@@ -25,7 +25,6 @@ from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
-from ddrecon.progress import Progress
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.loop import Reconstruction
@@ -189,7 +188,7 @@ class Uncertainty(Job):
                 numbers[name] = _with_deviation(value, torch.cat(errors))
         return numbers
 
-    def finish(self, progress: Progress) -> Told:
+    def finish(self) -> Told:
         """Writes deviations, as volumes and as a page, and tells `uncertainty.json`."""
         fields, numbers, path = self.fields(), self.numbers(), self.path
         (path / "volumes").mkdir(exist_ok=True)
@@ -215,14 +214,17 @@ class Uncertainty(Job):
         lines = [_field_text(name, field) for name, field in record["fields"].items()]
         rows = [(n, f"{x['value']:.5g} +- {x['deviation']:.2g}") for n, x in numbers.items()]
         scene = self.run.current_scene()
-        smoke = {name: value.cpu() for name, value in fields_of(scene).items()}
-        off = {f"deviation of {n}": f.deviation for n, f in fields.items() if f.parameter.is_field}
-        shown = next(iter(off), "density")
+        shown = {
+            f"deviation of {n}": f.deviation for n, f in fields.items() if kind_of(n).is_cellwise
+        }
+        first = next(iter(shown), "density")
+        shown = {name: value.cpu() for name, value in fields_of(scene).items()} | shown
+        cells = [(name, "result", value, None) for name, value in shown.items()]
         write_page(
             path / "report.html",
             title=f"ddrecon: how sure a run is ({path.absolute().name})",
             lead=f"{lead}.",
-            volume=describe_fields(scene, {"result": smoke | off}, lines, shown),
+            volume=describe_fields(scene, cells, lines, first),
             numbers={"heading": "Numbers", "head": ("", ""), "rows": rows, "text": ASSUMED},
         )
         return record, [lead, *lines, *(f"{name}: {text}" for name, text in rows), ASSUMED]

@@ -16,6 +16,7 @@ from ddrecon.extras import advice
 from ddrecon.io.images.films import frame_times, read_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
+from ddrecon.run.render_folder import rounds_text
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
@@ -56,6 +57,7 @@ def test_what_a_render_writes_and_says(succeed: Run) -> None:
         for solve in report["solves"]
         if solve["kind"] == "forward"
     ] == [True, True]  # diffusion's own, and that of the round
+    assert report["rounds"].keys() == {"count", "residual", "tolerance"}
     target = np.load("front.npy").astype(float)
     expected = 10 * np.log10(target.max() ** 2 / np.square(pixels("front") - target).mean())
     assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
@@ -114,21 +116,22 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, said: int, made: int
     assert field.bounds is not None and field.bounds.tolist() == [[-0.5] * 3, [0.5] * 3]
 
 
-REST = [("1", "null", "what diffusion alone lacks"), ("16", "0.01", "at rest")]
-REST += [("2", "0.1", "at rest"), ("2", "1e-6", "not at rest"), ("3", "null", "at rest")]
-
-
-@pytest.mark.parametrize(("rounds", "tolerance", "verdict"), REST)
+@pytest.mark.parametrize(
+    ("count", "residual", "tolerance", "verdict"),
+    [
+        (1, 0.3, None, "what diffusion alone lacks"),
+        (3, 0.0099, None, "at rest"),
+        (3, 0.011, None, "not at rest"),
+        (1, 0.09, 0.1, "at rest"),
+        (2, 2e-6, 1e-6, "not at rest"),
+    ],
+)
 def test_it_is_said_whether_light_has_come_to_rest(
-    succeed: Run, rounds: str, tolerance: str, verdict: str
+    count: int, residual: float, tolerance: float | None, verdict: str
 ) -> None:
-    said = "-D", f"diffusion={{transport_rounds: {rounds}, transport_tolerance: {tolerance}}}"
-    out = succeed(*RENDER, "--view", "side", *said).stdout
-    report = json.loads(Path("out/render.json").read_text())["rounds"]
-    changed = f"changed light by {100 * report['residual']:.2g} %: {verdict}"
-    assert f"transport rounds: {report['count']}, the last {changed}" in out
-    least = 0.01 if tolerance == "null" else float(tolerance)
-    assert (report["residual"] < least) == (verdict == "at rest")
+    told = rounds_text(count, residual, tolerance)
+    begin = f"transport rounds: {count}, the last changed light by {100 * residual:.2g} %: "
+    assert told.startswith(begin + verdict)
 
 
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
@@ -184,7 +187,8 @@ def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
     monkeypatch.setattr("ddrecon.run.render_folder.FEW", 2)
     options = [] if movie.startswith("out") else ["--movie", movie]
     ring = "--ring", "4", "--view", "front", "--size", "33", "21", "--fps", "12"
-    said = succeed(*RENDER, *ring, *options).stdout
+    said = succeed(*RENDER, *ROUND, *ring, *options).stdout
+    assert "transport rounds: 1, " in said
     report = json.loads(Path("out/render.json").read_text())
     names = [f"ring_{number:03d}" for number in range(4)]
     assert list(report["files"]) == names and report["psnr"] == {}
@@ -200,7 +204,9 @@ def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
         assert np.abs(frame.astype(float) - preview).mean() < (3 if movie == "m.mp4" else 0.01)
         exposed = encoded(pixels(name) / report["movie"]["white"])
         assert np.abs(preview - exposed).max() <= 1
-    succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front", "--size", "33", "21")
+    succeed(
+        "render", "scene.yaml", "-o", "front", "-q", "--view", "front", "--size", "33", "21", *ROUND
+    )
     np.testing.assert_allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
 
 

@@ -87,6 +87,15 @@ def test_distances_are_those_summed_cell_by_cell():
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=0)
 
 
+def test_in_layers_that_repeat_the_distance_is_the_thickness_of_those_that_have_a_medium():
+    grid = Grid((4, 3, 2), (0, 0, 0), (2.0, 3.0, 1.0), periodic=(1, 2))
+    weight = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    weight[:, 1:3] = 50 * random_values(2, 3, 2)
+    found = inverse_distance([Coefficient(torch.ones(()), weight)], grid)
+    expected = torch.tensor([0.0, 1, 1, 0], dtype=torch.float64).view(1, 4, 1, 1)
+    torch.testing.assert_close(found, expected.expand_as(found), rtol=0, atol=0.01)
+
+
 def test_flat_cells_have_distances_of_their_shape():
     """A plate of 2 w by 2 w has the mean 1 / distance asinh(1) / (w / 2) to its middle."""
     flat = Grid((4, 1, 1), (0.0, -1.0, -1.0), (4e-4, 1.0, 1.0))

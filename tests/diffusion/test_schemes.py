@@ -150,32 +150,6 @@ def test_derivatives_of_an_image_agree_with_each_other_and_differences():
     assert_derivatives(total, {name: value_of(scene, name) for name in names})
 
 
-def exact(operator: PrintedOperator, source: Tensor) -> Tensor:
-    return torch.linalg.solve(matrix_of(operator), source.flatten(1)).view_as(source)
-
-
-@pytest.mark.parametrize("is_transposed", [False, True])
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-13])
-def test_the_tolerance_is_a_relative_residual(tolerance: float, is_transposed: bool):
-    operator = make_printed(box_grid((4, 5, 3)))
-    operator = transposed(operator) if is_transposed else operator
-    source = random_values(2, 4, 5, 3, seed=3) - 0.5
-    solution = iterate_jacobi(operator, source, None, tolerance)
-    diagonal = operator.tensors[0]
-    residual = (source - operator.apply(solution.value)) / diagonal
-    assert 0 < solution.residual <= tolerance
-    assert float(residual.norm() / (source / diagonal).norm()) < 2 * tolerance
-    errors = {"rtol": 1e3 * tolerance, "atol": 1e2 * tolerance}
-    torch.testing.assert_close(solution.value, exact(operator, source), **errors)
-
-
-def test_a_color_without_source_stays_dark():
-    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3, seed=3)
-    source[0] = 0
-    value = iterate_jacobi(operator, source, random_values(2, 4, 5, 3), 1e-8).value
-    assert not value[0].any() and bool(value[1].any())
-
-
 @pytest.fixture
 def ball() -> Callable[..., Scene]:
     """A ball 0.7 `sigma` optical depths thick in empty space, its surface `width` cells wide."""

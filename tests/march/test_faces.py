@@ -185,8 +185,8 @@ def test_rays_that_miss_it_show_what_is_behind():
 def test_what_it_leaves_out_is_not_walked():
     """By bits: none of no support, and of blobs less than half of what all cells have."""
     pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-    from ddrecon.march.fused.bundle import pack_rays
     from ddrecon.march.fused.cells import find_walked
+    from ddrecon.march.fused.integrate import pack_rays
 
     scene = scene_with(two_blobs(), {}, half_width=0.6)
     grid = scene.volume.grid

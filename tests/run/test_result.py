@@ -79,7 +79,7 @@ def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g
             limit = 0.9 if parameter.name in ("albedo", "phase.weight") else torch.inf
             state = parameter.state()
             parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
-        job.finish(lambda views, _: views)
+        job.finish()
     return job.run.current_scene()
 
 

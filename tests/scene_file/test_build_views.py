@@ -169,7 +169,7 @@ def test_cameras_that_see_the_box_by_chance_are_asked_as_well() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate", "shift", "frames", "own", "apart"),
+    ("rate", "shift", "frames", "later", "apart"),
     [
         ("25", "0", (0, 30), {"time": 0.3}, ""),
         ("30", "0", (0, 30), {}, "30 frames a second and front.mp4 25: .* 0.2 s apart"),
@@ -184,13 +184,13 @@ def test_films_of_other_rates_are_refused(
     rate: str,
     shift: str,
     frames: tuple[int, int],
-    own: dict[str, Any],
+    later: dict[str, Any],
     apart: str,
 ) -> None:
     write_film(tmp_path / "front.mp4", 40, "25", *H264)
     write_film(tmp_path / "side.mov", 45, rate, *H264, shift=shift)
     views = [{"image": name, "camera": VIEW["camera"]} for name in ("front.mp4", "side.mov")]
-    views[1] |= own
+    views[1] |= later
     first, last = frames
     scene_file = read(changed(views=views, frames={"first": first, "last": last}))
     if not apart:

@@ -69,8 +69,8 @@ def test_a_tree_is_what_yaml_says_and_nodes_know_their_places():
     ],
 )
 def test_what_is_not_strict_yaml_is_refused_in_one_line(refusal: Refusal, text: str, line: str):
-    (found,) = refusal(text)
-    assert line in found
+    (problem_line,) = refusal(text)
+    assert line in problem_line
 
 
 def test_deep_nesting_is_refused_not_a_crash(refusal: Refusal):
@@ -91,13 +91,13 @@ def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
             read_scene(path)
         return str(caught.value)
 
-    told = "a.yaml: cannot be read: No such file or directory"
-    assert problem(tmp_path / "a.yaml").endswith(told)
+    fault = "a.yaml: cannot be read: No such file or directory"
+    assert problem(tmp_path / "a.yaml").endswith(fault)
     assert "cannot be read" in problem(tmp_path)
     for size in (MAX_BYTES + 1, 2**40):  # of which no more is read than tells
         with (tmp_path / "b.yaml").open("wb") as stream:
             stream.truncate(size)
-        told = f"b.yaml:1:{MAX_BYTES + 1}: is larger than 1 MiB"
-        assert told in problem(tmp_path / "b.yaml")
+        fault = f"b.yaml:1:{MAX_BYTES + 1}: is larger than 1 MiB"
+        assert fault in problem(tmp_path / "b.yaml")
     (tmp_path / "c.yaml").write_bytes(b"a: 1\nb: \xff\n")
     assert problem(tmp_path / "c.yaml").endswith("c.yaml:2:4: is not UTF-8 text")

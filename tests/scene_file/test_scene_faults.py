@@ -179,17 +179,17 @@ def test_what_is_wrong_with_a_scene(folder: Path, override: str, line: str) -> N
         overrides.insert(0, "optimize={parameters: {density: {}}}")
     with pytest.raises(SceneError) as caught:
         load_scene(folder / "scene.yaml", overrides=overrides)
-    (found,) = caught.value.problems
-    assert line in found.replace(f"{folder}/", "")
-    assert found.startswith(("-D ", f"{folder}/scene.yaml:"))
+    (problem,) = caught.value.problems
+    assert line in problem.replace(f"{folder}/", "")
+    assert problem.startswith(("-D ", f"{folder}/scene.yaml:"))
 
 
 @pytest.mark.parametrize(("override", "line"), rows(FILES))
 def test_what_is_wrong_with_a_file(folder: Path, override: str, line: str) -> None:
     with pytest.raises(FormatError) as caught:
         load_scene(folder / "scene.yaml", overrides=[override])
-    (found,) = caught.value.lines
-    assert line in found.replace(f"{folder}/", "") and found.startswith(f"{folder}/")
+    (problem,) = caught.value.lines
+    assert line in problem.replace(f"{folder}/", "") and problem.startswith(f"{folder}/")
 
 
 def test_what_a_field_may_hold_depends_on_what_it_is_used_for(folder: Path) -> None:

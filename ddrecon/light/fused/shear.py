@@ -72,6 +72,7 @@ class _Masses(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.shears, ctx.columns, *tensors = inputs
         ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
         keep(ctx, *tensors, *output[1:])
 
     @staticmethod
@@ -81,7 +82,8 @@ class _Masses(torch.autograd.Function):
         laid = dict(zip(_slicings(ctx.shears), tensors, strict=False))
         slopes = iter(tensors[len(laid) :])
         bars = {slicing: field.new_zeros(field.shape) for slicing, field in laid.items()}
-        numbers_bar = torch.zeros_like(numbers)
+        # No column varies of beams that stay.
+        numbers_bar = torch.zeros_like(numbers) if ctx.columns else numbers
         for light, shear in enumerate(ctx.shears):
             mass_bar = shear.slicing.lay(entered_bar[light]).contiguous()
             row, field, ray_slopes = numbers[light], laid[shear.slicing], next(slopes)
@@ -97,7 +99,7 @@ class _Masses(torch.autograd.Function):
                 d_row[column].fill_(1)
                 d_mass = _sum_tangent(shear, field, row, torch.zeros_like(field), d_row)
                 numbers_bar[light, column] = (d_mass * mass_bar).sum(dtype=torch.float64)
-        return None, None, numbers_bar, *bars.values()
+        return None, None, numbers_bar if ctx.columns else None, *bars.values()
 
     @staticmethod
     def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:

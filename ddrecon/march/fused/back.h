@@ -56,11 +56,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
         bool is_asked = false;
         for (int i = 0; i < L::OUT; ++i) {
-            bar[i] = inside * P::load(bars.out + row_of(i), begin, 1, last);
+            bar[i] = inside * bar_of(bars.out, i);
             is_asked = is_asked || !this->is_nothing(bar[i]);
         }
         for (int k = 0; k < L::EXTINCTION; ++k) {
-            m_bar[k] = inside * P::load(bars.masses + row_of(k), begin, 1, last);
+            m_bar[k] = inside * bar_of(bars.masses, k);
             m[k] = P::load_wide(bars.mass + row_of(k), begin, last);
             is_asked = is_asked || !this->is_nothing(m_bar[k]);
         }
@@ -74,6 +74,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         // Pixels that nothing is asked of, masked ones for instance, need no walk.
         if (is_asked) walk(bar, m);
         store();
+    }
+
+    // Row k of an array that has a number of each ray, if any.
+    V bar_of(const F* array, int k) const {
+        return array ? P::load(array + row_of(k), begin, 1, last) : zero;
     }
 
     // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.

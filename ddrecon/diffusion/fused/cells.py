@@ -1,4 +1,8 @@
-"""The system of E2.7 and the flux of E2.5 as functions of tensors, with derivatives (`faces.h`)."""
+"""Functions of cells, of what is around them, and of their faces, by fused kernels.
+
+D of a medium and linear functions of neighbors (E2.9, `cells.h`), the system of E2.7 and the flux
+of E2.5 (`faces.h`), all with derivatives.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,59 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.cell_function import RowFunction, Tensors
-from ddrecon.medium.coefficients import Medium
+from ddrecon.diffusion.closures import inverse_distance
+from ddrecon.kernels.cell_function import RowFunction, Tensors, apply_cell
+from ddrecon.medium.coefficients import Coefficient, Medium
+from ddrecon.numerics.remember import constant
 
-HEADER = "diffusion/fused/faces.h"
+_LINES, _SIZES = "Line3(row, nz, ny, nx), ", "int nz, ny, nx"
 PLACE = "Mesh<F>(row, nz, ny, nx, periodic, hz, hy, hx), matrix_colors, "
 GIVEN = "int nz, ny, nx, periodic, matrix_colors; F hz, hy, hx"
+
+
+def close_medium(medium: Medium) -> Tensor:
+    """D [u], `[C, z, y, x]`, of `medium` by `geometric`."""
+    terms = _extinction_terms(medium)
+    fields = [inverse_distance(terms, medium.grid), *(term.field for term in terms)]
+    colors = max(map(len, (*fields, *(term.scale for term in terms))))
+    scales = torch.stack([term.scale.reshape(-1).expand(colors) for term in terms])
+    cell = f"Geometric<{len(terms)}>"
+    (diffusion,) = apply_cell("diffusion/fused/cells.h", cell, 1, scales, *fields)
+    return diffusion
+
+
+def _extinction_terms(medium: Medium) -> list[Coefficient]:
+    """Terms of kappa_tr: one where absorption and scattering share a field."""
+    absorption, scattering, turned = medium.absorption, medium.scattering, 1 - medium.g
+    if medium.is_cellwise:
+        return [absorption, Coefficient(scattering.scale, turned * scattering.field)]
+    if absorption.field is scattering.field:
+        return [Coefficient(absorption.scale + turned * scattering.scale, absorption.field)]
+    return [absorption, Coefficient(turned * scattering.scale, scattering.field)]
+
+
+def rises_fused(q: Tensor) -> Tensor:
+    """As `cell_gradient`."""
+    return _look_around("Rises", (3, *q.shape), q)
+
+
+def bends_fused(field: Tensor) -> Tensor:
+    """As `bend`."""
+    return _look_around("Bends", field.shape, field)
+
+
+def average_fused(field: Tensor) -> Tensor:
+    """As `average`."""
+    for axis in range(3):
+        field = _look_around(f"Means<{axis}>", field.shape, field)
+    return field
+
+
+def _look_around(name: str, shape: Sequence[int], field: Tensor) -> Tensor:
+    z, y, x = field.shape[1:]
+    header, sizes = "diffusion/fused/cells.h", {"nz": z, "ny": y, "nx": x}
+    function = RowFunction(header, name, (tuple(shape),), x, _LINES, _SIZES, sizes)
+    return function.apply(constant([0.0], field)[None].expand(1, len(field)), field)[0]
 
 
 def assemble_system(
@@ -78,6 +129,8 @@ def _find(
     place = {"nz": z, "ny": y, "nx": x, **dict(zip(("hz", "hy", "hx"), grid.spacing, strict=True))}
     place |= {"periodic": sum(1 << axis for axis in grid.periodic), "matrix_colors": len(diffusion)}
     name, without = f"Flow<{flow}, {added * math.prod(moments)}>", f"Flow<{flow}, 0>"
-    function = RowFunction(HEADER, name, shapes, x, PLACE, GIVEN, place, added, without)
+    function = RowFunction(
+        "diffusion/fused/faces.h", name, shapes, x, PLACE, GIVEN, place, added, without
+    )
     stacked = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
     return function.apply(stacked, *fields)

@@ -1,8 +1,9 @@
-"""Camera files of NeRF, instant-ngp and nerfstudio: read, written, refused by key."""
+"""Camera files of other programs: read, written, refused by key."""
 
 import itertools
 import json
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,24 +15,27 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.cameras import cast_rays
+from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import FormatError, SceneError
+from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.build_views import remove_pictures
+from ddrecon.scene_file.camera_files import MODELS, UNMODELED, export_transforms
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
-from ddrecon.scene_file.transforms import export_transforms
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     OpencvSection,
     PerspectiveSection,
     ViewSection,
 )
+from ddrecon.settings import LENSES
 
 Read = Callable[..., SceneFile]
 POSE = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, 0.6, 1.8], [0.0, -0.6, 0.8, 2.4], [0.0, 0.0, 0.0, 1.0]]
 """Looks at the origin, nearly: from behind it along z and from above along y."""
 SIZES = {"w": 8, "h": 6, "fl_x": 20.0, "fl_y": 19.0, "cx": 4.3, "cy": 2.9}
-OTHERS = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "aabb_scale": 16}
-NERFSTUDIO = SIZES | OTHERS | {"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "ply_file_path": "a"}
+IGNORED = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "aabb_scale": 16}
+NERFSTUDIO = SIZES | IGNORED | {"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "ply_file_path": "a"}
 
 
 def frame(name: str | None = "images/frame_00001.npy", **others: Any) -> dict[str, Any]:
@@ -82,7 +86,7 @@ def angle(focal: float, pixels: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("shared", "own", "focal"),
+    ("shared", "of_frame", "focal"),
     [
         ({"fl_x": 20, "fl_y": 19}, {}, (20, 19)),
         ({"camera_angle_x": angle(20, 8), "camera_angle_y": angle(19, 6)}, {}, (20, 19)),
@@ -96,9 +100,9 @@ def angle(focal: float, pixels: int) -> float:
     ],
 )
 def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
-    views: Any, shared: Any, own: Any, focal: tuple[float, float]
+    views: Any, shared: Any, of_frame: Any, focal: tuple[float, float]
 ) -> None:
-    (view,) = views(frame(**own), **({"w": 8, "h": 6} | shared))
+    (view,) = views(frame(**of_frame), **({"w": 8, "h": 6} | shared))
     (width, _), (focal_x, focal_y) = view.camera.resolution, focal
     assert view.camera.fov == pytest.approx(math.degrees(angle(focal_x, width)), rel=1e-14)
     assert view.camera.pixel_aspect == pytest.approx(focal_x / focal_y, rel=1e-14)
@@ -106,7 +110,7 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
 
 
 @pytest.mark.parametrize(
-    ("shared", "own", "expected"),
+    ("shared", "of_frame", "expected"),
     [
         ({"k1": -0.1, "k2": 0.02}, {"k1": 0.05}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "PINHOLE"}, None),
@@ -117,9 +121,9 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
     ],
 )
 def test_a_lens_is_a_frames_own_before_that_of_its_file(
-    views: Any, shared: Any, own: Any, expected: FisheyeSection | None
+    views: Any, shared: Any, of_frame: Any, expected: FisheyeSection | None
 ) -> None:
-    (view,) = views(frame(**own), **(SIZES | shared))
+    (view,) = views(frame(**of_frame), **(SIZES | shared))
     assert view.camera.distortion == expected
 
 
@@ -135,7 +139,7 @@ def test_a_frame_takes_precedence_over_its_file(views: Any, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "there", "image"),
+    ("name", "existing", "image"),
     [
         ("images\\r_0.png", ["images/r_0.png"], "images/r_0.png"),
         (".\\images\\r_0", [], "images/r_0.png"),
@@ -148,10 +152,10 @@ def test_a_frame_takes_precedence_over_its_file(views: Any, tmp_path: Path) -> N
     ],
 )
 def test_which_picture_a_name_means(
-    views: Any, tmp_path: Path, name: str, there: list[str], image: str
+    views: Any, tmp_path: Path, name: str, existing: list[str], image: str
 ) -> None:
     (tmp_path / "images").mkdir()
-    for file in there:
+    for file in existing:
         (tmp_path / file).touch()
     (view,) = views(frame(name), **NERFSTUDIO)
     assert view.image == tmp_path / image
@@ -302,16 +306,16 @@ def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
         export_transforms(build_scene(scene_file), scene_file, path, may_exist=False)
 
 
-LENSES = {
+DISTORTED = {
     "OPENCV": {"k1": -0.1, "k2": 0.02, "k3": 0.0, "k4": 0.0, "p1": 1e-3, "p2": -2e-3},
     "OPENCV_FISHEYE": {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0},
 }
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", DISTORTED)
 def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> None:
     """Through our own scene files and transforms, to the same rays."""
-    numbers = SIZES | OTHERS | {"camera_model": model, **LENSES[model]}
+    numbers = SIZES | IGNORED | {"camera_model": model, **DISTORTED[model]}
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
     dump_scene(describe(scene_file), tmp_path / "dump.yaml")
     assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
@@ -332,3 +336,190 @@ def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path, numbers: 
     with pytest.raises(SceneError, match="folds over within the image") as caught:
         build_scene(scene_file)
     assert len(caught.value.problems) == 1
+
+
+# COLMAP: rays as its manual has them, text and binary alike, and refusals in one line.
+
+CAMERAS: dict[str, list[float]] = {
+    "SIMPLE_PINHOLE": [20.0, 4.2, 3.1],
+    "PINHOLE": [20.0, 19.0, 4.2, 3.1],
+    "SIMPLE_RADIAL": [20.0, 4.2, 3.1, -0.2],
+    "RADIAL": [20.0, 4.2, 3.1, -0.2, 0.1],
+    "OPENCV": [20.0, 19.0, 4.2, 3.1, -0.2, 0.1, 0.01, -0.02],
+    "OPENCV_FISHEYE": [20.0, 19.0, 4.2, 3.1, 0.05, -0.02, 0.01, 0.0],
+}
+QUATERNION = np.array([0.2, 0.9, -0.3, 0.1])
+SHIFT = np.array([0.1, -0.2, 3.0])
+"""Of a camera that looks at the world's origin from 3 u away, nearly."""
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """By the sandwich q v q*, vector by vector."""
+    w, *axis = quaternion / np.linalg.norm(quaternion)
+    u = np.array(axis)
+    columns = [2 * (u @ v) * u + (w * w - u @ u) * v + 2 * w * np.cross(u, v) for v in np.eye(3)]
+    return np.stack(columns, 1)
+
+
+def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = " ".join(map(str, CAMERAS[model]))
+    (folder / "cameras.txt").write_text(f"# cameras\n7 {model} 8 6 {numbers}\n")
+    pose = " ".join(map(str, [*QUATERNION, *SHIFT]))
+    points = "1.5 2.5 -1 3.5 4.5 12"
+    (folder / "images.txt").write_text(
+        f"# images\n3 {pose} 7 {name}\n{points}\n4 {pose} 7 a.png\n\n"
+    )
+
+
+def write_binary(
+    folder: Path, model: str, name: str = "b c.png", points: tuple[int, int] = (2, 0)
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = CAMERAS[model]
+    header = struct.pack("<QiiQQ", 1, 7, list(MODELS).index(model), 8, 6)
+    (folder / "cameras.bin").write_bytes(header + struct.pack(f"<{len(numbers)}d", *numbers))
+    content = struct.pack("<Q", 2)
+    for index, label, count in ((3, name, points[0]), (4, "a.png", points[1])):
+        content += struct.pack("<i7di", index, *QUATERNION, *SHIFT, 7) + label.encode() + b"\0"
+        content += struct.pack("<Q", count) + bytes(24 * count)
+    (folder / "images.bin").write_bytes(content)
+
+
+def scene_text(**others: Any) -> str:
+    return changed(views={"colmap": "sparse/0", "images": "pictures", **others})
+
+
+@pytest.mark.parametrize("store", [write_text, write_binary])
+@pytest.mark.parametrize("model", CAMERAS)
+def test_points_are_seen_where_the_manual_says(
+    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+) -> None:
+    """x = R X + t, divided by its depth, distorted, and times the focal lengths plus the center."""
+    store(tmp_path / "sparse/0", model)
+    scene_file = read(scene_text())
+    first, second = scene_file.tree.views
+    assert (first.name, second.name) == ("a", "b_c")
+    assert second.image == tmp_path / "pictures" / "b c.png"
+    scene = build_scene(remove_pictures(scene_file, None), dtype=torch.float64)
+    camera = scene.views[1].camera
+    parameters = dict(zip(MODELS[model].split(), CAMERAS[model], strict=True))
+    lens = "fisheye" if model == "OPENCV_FISHEYE" else "opencv"
+    numbers = torch.tensor([parameters.get(name, 0.0) for name in LENSES[lens]]).double()
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)))
+    rays = points @ torch.from_numpy(rotation(QUATERNION).T) + torch.from_numpy(SHIFT)
+    focal = [parameters.get(name, parameters.get("f")) for name in ("fl_x", "fl_y")]
+    expected = distort(lens, numbers, rays) * torch.tensor(focal) + torch.tensor([4.2, 3.1])
+    seen, _ = project(camera, points)
+    is_seen = ~seen.isnan().any(1)
+    assert is_seen.any()
+    torch.testing.assert_close(seen[is_seen], expected[is_seen], atol=1e-5, rtol=0)
+    center = -rotation(QUATERNION).T @ SHIFT
+    torch.testing.assert_close(cast_rays(camera).eye.flip(0), torch.tensor(center))
+
+
+def test_one_in_so_many_is_a_test_view(read: Read, tmp_path: Path) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    views = read(scene_text(test_every=2)).tree.views
+    assert [view.split for view in views] == ["test", "train"]
+
+
+IMAGE = "1 0.2 0.9 -0.3 0.1 0.1 -0.2 3.0 7"
+POINTS = "1.5 2.5 -1 3.5 4.5 12"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["a.png", "b 2.png", "b 10.png"],
+        ["b 10.png", "", "a.png", "b 2.png"],
+        ["b 2.png", POINTS, "b 10.png", "a.png"],
+        ["", "", "a.png", "", "  ", "# c", "b 10.png", POINTS, "", "b 2.png"],
+    ],
+)
+def test_lines_of_points_may_be_missing(read: Read, tmp_path: Path, lines: list[str]) -> None:
+    """No image is taken for points; pictures are in order of their numbers."""
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    text = [f"{IMAGE} {line}" if line.endswith("png") else line for line in lines]
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join(text))
+    assert [view.name for view in read(scene_text()).tree.views] == ["a", "b_2", "b_10"]
+
+
+def test_a_line_that_is_neither_is_refused(read: Read, tmp_path: Path) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    (tmp_path / "sparse/0/images.txt").write_text(f"{IMAGE} a.png\n{IMAGE}")
+    with pytest.raises(FormatError, match="line 2: expected IMAGE_ID"):
+        read(scene_text())
+
+
+def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
+    """With a byte order mark, other ends of lines, and backslashes; but not out of the folder."""
+    folder = tmp_path / "sparse/0"
+    write_text(folder, "PINHOLE", "left\\c.png")
+    for path in folder.iterdir():
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-8-sig"))
+    views = read(changed(views={"colmap": "sparse\\0", "images": "pictures"})).tree.views
+    assert [view.image for view in views] == [
+        tmp_path / "pictures" / name for name in ("a.png", "left/c.png")
+    ]
+    write_text(folder, "PINHOLE", "left\\..\\..\\c.png")
+    with pytest.raises(FormatError, match="leaves the folder of pictures"):
+        read(scene_text())
+
+
+@pytest.mark.parametrize("model", UNMODELED)
+def test_cameras_that_no_image_has_may_be_of_any_model(
+    read: Read, tmp_path: Path, model: str
+) -> None:
+    """As text, and in a binary file, which says nothing of their length."""
+    text, binary, count = tmp_path / "sparse/0", tmp_path / "sparse/1", UNMODELED[model]
+    write_text(text, "PINHOLE")
+    write_binary(binary, "PINHOLE")
+    before = read(scene_text()).tree
+    with (text / "cameras.txt").open("a") as stream:
+        stream.write(f"8 {model} 8 6 {'0.5 ' * count}\n")
+    cameras, kind = (binary / "cameras.bin").read_bytes()[8:], [*MODELS, *UNMODELED].index(model)
+    strange = struct.pack(f"<QiiQQ{count}d", 2, 8, kind, 8, 6, *[0.5] * count)
+    (binary / "cameras.bin").write_bytes(strange + cameras)
+    assert read(scene_text()).tree == read(scene_text(colmap="sparse/1")).tree == before
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "problem"),
+    [
+        ("cameras.txt", "PINHOLE", "FOV", "camera 7: lens model FOV is not known; undistort"),
+        ("cameras.txt", " 3.1", "", "camera 7: PINHOLE has 4 parameters, fl_x, fl_y, cx, cy"),
+        ("cameras.txt", "8 6", "8 x", "line 2: expected CAMERA_ID MODEL WIDTH"),
+        ("cameras.txt", "8 6", "8 0", "camera 7.h: must be at least 1, found 0"),
+        ("cameras.txt", "20.0", "-20", "camera 7.fl_x: must be above 0"),
+        ("cameras.txt", "20.0", "nan", "camera 7.fl_x: expected a finite number"),
+        ("images.txt", " 7 b", " 8 b", "image 'b c.png': there is no camera 8"),
+        ("images.txt", "b c.png", "/etc/c.png", "image '/etc/c.png' leaves the folder of pictures"),
+        ("images.txt", "b c.png", "d/../../c.png", "leaves the folder of pictures"),
+        ("images.txt", "3 0.2", "3 x", "line 2: expected IMAGE_ID QW QX"),
+        ("images.txt", "0.2 0.9 -0.3 0.1 0.1", "0 0 0 0 0.1", "not finite, or no rotation"),
+    ],
+)
+def test_a_damaged_text_is_refused(
+    read: Read, tmp_path: Path, file: str, old: str, new: str, problem: str
+) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    path = tmp_path / "sparse/0" / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises((FormatError, SceneError)) as caught:
+        read(scene_text())
+    assert problem in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
+def test_a_damaged_binary_is_refused(read: Read, tmp_path: Path, file: str) -> None:
+    """Cut anywhere, in points that are skipped as well, or claiming more than there is."""
+    write_binary(tmp_path / "sparse/0", "OPENCV", points=(0, 2))
+    path = tmp_path / "sparse/0" / file
+    whole = path.read_bytes()
+    for damaged in (whole[:5], whole[:30], whole[:-5], b"\xff" * 8 + whole[8:], b""):
+        path.write_bytes(damaged)
+        with pytest.raises((FormatError, SceneError)) as caught:
+            read(scene_text())
+        assert "\n" not in str(caught.value)

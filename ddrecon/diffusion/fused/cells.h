@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/kernels/cells.h"
-// Linear functions of a field around a cell, their tangents and cotangents: by how much it rises
-// from cell to cell (E2.9), and the sum of its second differences.
+// Functions of a cell and of what is around it. Linear ones, with their tangents and cotangents: by
+// how much a field rises from cell to cell (E2.9), and the sum of its second differences.
 
 namespace ddrecon {
 
@@ -96,5 +96,35 @@ template <class Around, class F> INLINE void find_cotangents(
     line.add<Around, true, 2>(bar[2], result);
     sums[row.item] = F(0);
 }
+
+// D = 1 / (3 kappa_tr + 4 / distance), as `diffusion/closures.py` has it. Its fields are 1 /
+// distance and those of so many TERMS of kappa_tr, its numbers their scales.
+template <int TERMS> struct Geometric {
+    static constexpr int INS = 1 + TERMS, NUMBERS = TERMS, OUTS = 1;
+
+    template <class N> INLINE static void find(const N* in, const N* number, N* out) {
+        const N spreading = 4 * in[0];
+        N extinction = number[0] * in[1];
+        UNROLLED
+        for (int k = 1; k < TERMS; ++k) extinction += number[k] * in[1 + k];
+        const N ratio = 3 * extinction / spreading;
+        const N continued = 1 - ratio + ratio * ratio;
+        out[0] = pick(value_of(ratio) < 0, continued, 1 / (1 + ratio)) / spreading;
+    }
+};
+
+// Light at a center, >= 0, of its mean, its second differences and the extinction's field (E2.12);
+// the number makes that optical depths of what is thin.
+struct Sharp {
+    static constexpr int INS = 3, NUMBERS = 1, OUTS = 1;
+
+    template <class N> INLINE static void find(const N* in, const N* number, N* out) {
+        // to the fourth power, which must not overflow
+        const N full = number[0] * in[2], depth = full / (1 + full / 1000000);
+        const N square = depth * depth;
+        const N light = in[0] - in[1] / (8 * (1 + square * square));
+        out[0] = pick(value_of(light) < 0, 0 * light, light);
+    }
+};
 
 } // namespace ddrecon

@@ -1,4 +1,4 @@
-"""What `ddrecon reference` writes and says."""
+"""How far results can be trusted: `reference`, `gradcheck`, and commands on another device."""
 
 import json
 import sys
@@ -8,7 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
+from far_device import FAR
 from small_scene import contents
+from torch import Tensor
+
+from ddrecon.cli.session import Session
+from ddrecon.losses import Target
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -65,3 +70,49 @@ def test_without_mitsuba(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     told = 'the reference renderer needs mitsuba: pip install "ddrecon[reference]"'
     assert refuse(3, *REFERENCE) == [told]
+
+
+SMALL = ["-D", "volume.resolution=[4, 3, 3]"]
+SIMPLE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0"]
+GRADCHECK = ["gradcheck", "scene.yaml", "-q", "--samples", "2"]
+
+
+def test_the_program_passes(run: Run) -> None:
+    result = run(*GRADCHECK, *SMALL, "--json", "report.json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout.splitlines()[-1].startswith("| density | pass |")
+    report = json.loads(Path("report.json").read_text())
+    assert report["passed"] is True
+    (check,) = report["checks"]
+    assert (check["parameter"], check["passed"], len(check["entries"])) == ("density", True, 3)
+    assert check["modes_error"] < 1e-10 and max(entry["error"] for entry in check["entries"]) < 1e-6
+
+
+def detaching_part(right: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """The image loss with the right value and nine tenths of its derivative."""
+    return lambda target, image: right(target, 0.9 * image + 0.1 * image.detach())
+
+
+def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Target, "loss_of", detaching_part(Target.loss_of))
+    result = run(*GRADCHECK, *SMALL, *SIMPLE, "--json", "report.json")
+    assert (result.exit_code, result.stderr) == (1, "")
+    assert result.stdout.splitlines()[-1].startswith("| density | FAIL |")
+    report = json.loads(Path("report.json").read_text())
+    assert report["passed"] is False
+    errors = [entry["error"] for entry in report["checks"][0]["entries"]]
+    assert errors == pytest.approx([0.1] * len(errors), abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("shapes_by_python")
+def test_commands_end_well_there(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Session, "start", lambda _: FAR)
+    text = Path("scene.yaml").read_text()
+    Path("scene.yaml").write_text(text.replace("  - {type: ambient, radiance: 0.1}\n", ""))
+    succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "2")
+    succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "3", "--resume")
+    succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1")
+    succeed("render", "run", "-o", "seen")
+    succeed("gradcheck", "scene.yaml", "--samples", "2")
+    assert Path("run/report.html").is_file() and Path("seen/front.npy").is_file()

@@ -1,9 +1,13 @@
-"""Camera files of NeRF, instant-ngp and nerfstudio (`transforms.json`), read and written.
+"""Camera files of NeRF, instant-ngp and nerfstudio (`transforms.json`), and COLMAP's models.
 
 What a frame says takes precedence over what the file says. Poses are camera to world with OpenGL
 axes and stay as they stand: what tells other programs how to map them into a box of their own
 (`scale`, `offset`, `aabb_scale`, `applied_transform`) is not for us. Intrinsics are in pixels, or
 there is an angle of view.
+
+A COLMAP model is a folder with `cameras.txt` and `images.txt`, or the same as `.bin`. Its poses are
+world to camera with OpenCV's axes (right, down, forward); its points are of no use and are skipped.
+Source: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -12,18 +16,19 @@ import json
 import math
 import os
 import re
+import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.read import read_as
+from ddrecon.scene_file.read import path_in, read_as
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,
@@ -76,6 +81,28 @@ MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
 """What is refused, as it is not read, of a frame that says no focal length besides."""
 NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """What lenses are called there."""
+MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fl_x fl_y cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
+}
+"""The models that are read, in the order of their numbers in binary files, and their parameters."""
+UNMODELED = {
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
+"""Models of which no image may be, and how many parameters they have."""
+Lens = tuple[str, tuple[int, int], Sequence[float]]
+"""A camera of a model: what it is called, its width and height, and its parameters."""
+Posed = tuple[str, int, Sequence[float]]
+"""An image of a model: its name, its camera's number, and the rotation and shift to it."""
 Entries = Mapping[str, Node]
 
 
@@ -261,6 +288,153 @@ def _distortion(entries: Entries) -> LensSection | None:
         if (value := lens.pop(name)) != 0:
             raise entries[name].refused(f"{name} = {value:g} is not modeled; {REMEDY}")
     return section(**lens) if is_fisheye or any(lens.values()) else None
+
+
+def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
+    """The views of the model in `folder`, which `node` of a scene names, in order of their images.
+
+    Their pictures are in the folder `images`; they have no names yet. Raises SceneError where there
+    is no model, FormatError for one that is damaged or distorted in a way that is not known.
+    """
+    suffix = next((end for end in ("txt", "bin") if (folder / f"images.{end}").is_file()), None)
+    if suffix is None or not (folder / f"cameras.{suffix}").is_file():
+        raise node.refused(
+            f"{folder} has no COLMAP model; expected cameras.txt and images.txt, or .bin"
+        )
+    path, of_cameras = folder / f"images.{suffix}", folder / f"cameras.{suffix}"
+    with guard_reading(of_cameras):
+        cameras = dict(READERS[suffix][0](of_cameras))
+    with guard_reading(path):
+        posed = sorted(READERS[suffix][1](path), key=lambda image: in_order(image[0]))
+    if not posed:
+        raise FormatError(path, "has no images")
+    views = []
+    for name, number, pose in posed:
+        if number not in cameras:
+            raise FormatError(path, f"image {name!r}: there is no camera {number}")
+        picture = PurePosixPath(name.replace("\\", "/"))
+        if picture.is_absolute() or ".." in picture.parts:
+            raise FormatError(path, f"image {name!r} leaves the folder of pictures; rename it")
+        camera = _colmap_camera(of_cameras, number, *cameras[number])
+        frame = camera | {"transform_matrix": _matrix(path, name, pose)}
+        with in_file(of_cameras):
+            described = node_of(f"camera {number}", str(of_cameras), frame)
+            section = read_camera(described, described.entries(), folder)
+        views.append(ViewSection(camera=section, image=path_in(images, name)))
+    return views
+
+
+def _matrix(path: Path, name: str, pose: Sequence[float]) -> list[list[float]]:
+    """Camera to world with OpenGL axes."""
+    import numpy as np
+
+    quaternion, shift = np.array(pose[:4]), np.array(pose[4:])
+    norm = math.sqrt(float(quaternion @ quaternion))
+    if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):
+        raise FormatError(path, f"image {name!r}: its pose is not finite, or no rotation")
+    w, x, y, z = quaternion / norm
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    to_world = np.eye(3) - 2 * w * cross + 2 * cross @ cross
+    matrix = np.eye(4)
+    matrix[:3, :3] = to_world * (1, -1, -1)
+    matrix[:3, 3] = -to_world @ shift
+    return matrix.tolist()
+
+
+def _colmap_camera(
+    path: Path, number: int, model: str, size: tuple[int, int], parameters: Sequence[float]
+) -> dict[str, Any]:
+    """Camera `number` in the words of transforms.json."""
+    if model not in MODELS:
+        raise FormatError(path, f"camera {number}: lens model {model} is not known; {REMEDY}")
+    names = MODELS[model].split()
+    if len(parameters) != len(names):
+        fault = f"{model} has {len(names)} parameters, {', '.join(names)}"
+        raise FormatError(path, f"camera {number}: {fault}")
+    lens = dict(zip(names, parameters, strict=True))
+    if "f" in lens:
+        lens["fl_x"] = lens["fl_y"] = lens.pop("f")
+    return {"camera_model": model, "w": size[0], "h": size[1], **lens}
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text file that are neither empty nor comments, with their numbers."""
+    with path.open(encoding="utf-8-sig") as stream:
+        for number, line in enumerate(map(str.strip, stream), 1):
+            if line and not line.startswith("#"):
+                yield number, line
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for number, line in _lines(path):
+        try:
+            camera, model, width, height, *parameters = line.split()
+            yield int(camera), (model, (int(width), int(height)), [*map(float, parameters)])
+        except ValueError as error:
+            expected = f"CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
+            raise FormatError(path, f"line {number}: expected {expected}") from error
+
+
+def _text_images(path: Path) -> Iterator[Posed]:
+    for number, line in _lines(path):
+        if _are_points(line):  # of the image before, whose line of points may be missing
+            continue
+        try:
+            words = line.split(maxsplit=9)
+            yield words[9], int(words[8]), [float(word) for word in words[1:8]]
+        except (ValueError, IndexError) as error:
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise FormatError(path, f"line {number}: expected {expected}") from error
+
+
+def _are_points(line: str) -> bool:
+    """Whether `line` begins with points of an image: X Y POINT3D_ID each."""
+    words = line.split(maxsplit=12)[:12]
+    try:
+        [float(word) for word in words], [int(word) for word in words[2::3]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    lengths = {name: len(words.split()) for name, words in MODELS.items()} | UNMODELED
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            number, model, width, height = _unpack(path, stream, "<IiQQ")
+            if not 0 <= model < len(lengths):
+                raise FormatError(path, f"camera {number}: lens model {model} is not known")
+            name = [*lengths][model]
+            yield number, (name, (width, height), _unpack(path, stream, f"<{lengths[name]}d"))
+
+
+def _binary_images(path: Path) -> Iterator[Posed]:
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            _, *pose, camera = _unpack(path, stream, "<I7dI")
+            name = b"".join(iter(lambda: _unpack(path, stream, "c")[0], b"\0"))
+            (points,) = _unpack(path, stream, "<Q")
+            if 24 * points > path.stat().st_size - stream.tell():
+                raise FormatError(path, "ends too soon")
+            stream.seek(24 * points, 1)
+            yield name.decode(), camera, pose
+
+
+def _unpack(path: Path, stream: BinaryIO, layout: str) -> tuple[Any, ...]:
+    data = stream.read(struct.calcsize(layout))
+    if len(data) < struct.calcsize(layout):
+        raise FormatError(path, "ends too soon")
+    return struct.unpack(layout, data)
+
+
+READERS = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
+"""What reads cameras and images, by the suffix of their files."""
+
+
+def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]:
+    """A key that sorts names by each `number` in them, a regular expression: 2 before 10."""
+    words = re.split(f"({number})", name)
+    return [float(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
 def export_transforms(
