@@ -228,6 +228,7 @@ class Frame:
             "parameters": {p.name: p.state() for p in self.parameters},
             "total": dict(vars(self.total)),
             "solutions": dict(self.memory.last),
+            "iterations": dict(self.memory.iterations),
             "misfit": self.misfit,
         }
 
@@ -241,6 +242,8 @@ class Frame:
         """Takes up what solves begin from, at the resolution of `state`."""
         like = self.problem.scene.volume.density
         self.memory.last |= {kind: u.to(like) for kind, u in state["solutions"].items()}
+        # By which iterations are recorded on a GPU.
+        self.memory.iterations = dict(state["iterations"])
 
     def _differentiate(self, compared: Comparison) -> Differentiated:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
