@@ -84,6 +84,7 @@ Of `A|B` one is chosen, `NAME...` may be repeated, and a flag takes nothing.
 """
 ROWS = [re.split(r"\s{2,}", row) for row in re.split(r"\n(?=\w)", OPTIONS.strip())]
 SIDE = click.IntRange(1, 2**15)
+"""Pixels along a side."""
 TYPES: dict[str, click.ParamType | type | tuple[click.ParamType, ...]] = {
     "threads": click.IntRange(1),
     "seed": click.IntRange(-(2**31), 2**32 - 1),
@@ -112,10 +113,10 @@ def command(
 ) -> Callable[[Callable[..., None]], click.Command]:
     """Makes a click command of a function of a `Session`, which has the `common` options.
 
-    `sources` is the placeholder of what the command works on; `options` are names in `OPTIONS`,
-    those that no command can do without but for a question mark. An error of the user's becomes one
-    line and an exit code. The ranks of torchrun share the work where it `is_shared`; else the first
-    does it alone.
+    `sources` is the placeholder of what the command works on; `options` are names in `OPTIONS`, of
+    which `output?` may be left out, and `output` not. An error of the user's becomes one line and
+    an exit code. The ranks of torchrun share the work where it `is_shared`; else the first does it
+    alone.
     """
 
     def make(function: Callable[..., None]) -> click.Command:

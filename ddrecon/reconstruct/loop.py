@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -20,7 +21,7 @@ from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
-from ddrecon.reconstruct.metric import FieldMetric
+from ddrecon.reconstruct.metric import invert_metric
 from ddrecon.reconstruct.numbers import Numbers
 from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
@@ -172,7 +173,7 @@ class Reconstruction:
             "search": self.search.state(),
             "rival": self.rival,
             "diagonals": self.diagonals,
-            "numbers": self.numbers.state(),
+            "numbers": (self.numbers.matrix, self.numbers.prior),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -188,7 +189,7 @@ class Reconstruction:
         self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
         loss, values = state["rival"]
         self.rival = loss, {key: value.to(like[key]) for key, value in values.items()}
-        self.numbers.restore(state["numbers"])
+        self.numbers.matrix, self.numbers.prior = state["numbers"]
 
     def _pass_trial(self, is_over: bool) -> None:
         """Begins a trial of denser fields where one is due; ends one that `is_over`."""
@@ -289,16 +290,20 @@ class Reconstruction:
 
     def _metric(self, values: Values, free: Values) -> Inverse:
         """The inverse metric at `values`, of what is `free`."""
-        waiting, weight, metrics = self.schedule.stage.waiting, self.search.weight, {}
-        for key, p in self.blocks.items():
+        waiting, weight = self.schedule.stage.waiting, self.search.weight
+        inverses = dict[str, Callable[[Tensor], Tensor]]()
+        for key, diagonal in self.diagonals.items():
+            p, is_free = self.blocks[key], free[key]
             if p.tv and p.name not in waiting:
-                metrics[key] = FieldMetric(p, values[key], self.diagonals[key], weight, free[key])
+                inverses[key] = invert_metric(p, values[key], diagonal, weight, is_free)
+            else:
+                inverses[key] = partial(torch.mul, is_free / diagonal)
 
         def precondition(vectors: Sequence[Values]) -> list[Values]:
-            fields = dict[str, Tensor]()
-            for key, diagonal in self.diagonals.items():
-                bars, metric = torch.stack([vector[key] for vector in vectors]), metrics.get(key)
-                fields[key] = metric.solve(bars) if metric else bars * free[key] / diagonal
+            fields = {
+                key: invert(torch.stack([vector[key] for vector in vectors]))
+                for key, invert in inverses.items()
+            }
             return [
                 {key: bars[n] for key, bars in fields.items()}
                 | self.numbers.precondition(vector, free)

@@ -21,7 +21,7 @@ from ddrecon.medium.coefficients import Volume, scale_medium
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from as_on_a_gpu import ORDERS, as_on_a_gpu, headers_of
 
-from ddrecon.diffusion.fused import faces
+from ddrecon.diffusion.fused.cells import GIVEN, PLACE
 from ddrecon.diffusion.fused.passes import KernelSteps
 from ddrecon.kernels.cell_function import RowFunction
 
@@ -177,7 +177,7 @@ def test_colors_share_conductances(losses: int):
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    place = 1, faces.PLACE, faces.GIVEN
-    system = RowFunction(faces.HEADER, "Flow<SYSTEM, 1, 0>", ((),) * 5, *place)
-    flux = RowFunction(faces.HEADER, "Flow<FLUX, 1, 3>", ((3, 1, 1, 1, 1),), *place)
+    header, place = "diffusion/fused/faces.h", (1, PLACE, GIVEN)
+    system = RowFunction(header, "Flow<SYSTEM, 1, 0>", ((),) * 5, *place)
+    flux = RowFunction(header, "Flow<FLUX, 1, 3>", ((3, 1, 1, 1, 1),), *place)
     assert_compiles([system.kernel("tangents", 7, 32), flux.kernel("values", 9, 64)], tmp_path)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from media import (
     box_grid,
+    convergence_order,
     half_empty,
     make_camera,
     make_scene,
@@ -125,6 +126,21 @@ def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[flo
     found = mass_to_centers(torch.full(grid.shape, 3.0, dtype=torch.float64), grid, travel)
     assert int(same.sum()) > 100
     torch.testing.assert_close(found[same], 3 * way[same], rtol=1e-13, atol=0)
+
+
+def test_what_comes_through_a_side_is_received():
+    """Under a sun at 60 degrees, by columns of a layer that cells cross sideways: order 2."""
+    errors, depths = [], [1.0, 0.5, 0.25]
+    for depth in depths:
+        layers, columns = round(4 / depth), round(12 / depth)
+        grid = Grid((layers, 1, columns), (0, 0, 0), (4.0, 1e6, 12.0))
+        field = torch.ones(1, *grid.shape, dtype=torch.float64)
+        entered, step = sum_mass_to_cells(field, grid, unit((0.5, 0.0, 0.75**0.5)))
+        received = torch.exp(-entered) * (1 - torch.exp(-step)) / step
+        taken = 2 * depth * received[0, :, 0, -columns // 4 :].mean(1).sum()
+        errors.append(abs(float(taken) / (1 - math.exp(-8)) - 1))
+    assert errors[1] < 0.02, errors
+    assert convergence_order(depths, errors) >= 1.8, errors
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.4142, -0.5, 0.6)], ids=str)
