@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/kernels/dual.h"
-// Interpolation among four neighbors on a line, to third order (`numerics/interpolation.py`): what is
-// taken off linear interpolation where a field bends.
+// Interpolation among four neighbors on a line, to third order (`numerics/interpolation.py`): what
+// is taken off linear interpolation where a field bends.
 
 namespace ddrecon {
 
