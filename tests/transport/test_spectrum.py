@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.quadrature import sphere_quadrature
-from ddrecon.transport.sweep import DIRECTIONS, _spread
+from ddrecon.transport.sweep import _spread, count_directions, quadrature_of, sweep_rule
 
 Array = NDArray[Any]
 AXES = np.eye(3)
@@ -22,21 +21,18 @@ def harmonics_of(points: Array, degree: int) -> Array:
 
 
 def sweep_of_waves(
-    waves: Array, spacing: Array, points: Array, extinction: float
+    waves: Array, grid: Grid, points: Array, extinction: float
 ) -> tuple[Array, Array]:
     """What a sweep of exp(i k . cell) finds of E = 1, and of its slope, along each point [W, N].
 
     E2.9 with I_in = (I_out of the cells behind, by waves), solved for I_out.
     """
-    speed = points / spacing
+    speed = points / grid.spacing
     step = 1 / np.abs(speed).max(1)
     moved = speed * step[:, None]
     part, back = np.abs(moved), np.exp(-1j * waves[:, None] * np.sign(moved))
     behind = np.prod(1 - part + part * back, -1)
-    shares, lengths = (
-        np.array(one)
-        for one in _spread(Grid((2, 2, 2), (0.0,) * 3, tuple(2 * spacing)), len(points))
-    )
+    shares, lengths = (np.array(one) for one in _spread(grid, len(points)))
     d = extinction * lengths
     steep = 1 + 2 * shares * d * np.sqrt(36 + d * d) / (d * d + 0.01)
     d = extinction * step
@@ -50,15 +46,14 @@ def sweep_of_waves(
 
 
 def rounds_of_waves(
-    waves: Array, spacing: Array, g: float, degree: int, depth: float, albedo: float
+    waves: Array, grid: Grid, g: float, degree: int, depth: float, albedo: float
 ) -> tuple[Array, float]:
     """The matrices [W, K, K] of a round (E2.10) of waves, but the last, and E7.1's 0.9 p_2.
 
-    The medium has no end; `depth` is that of cells along their shortest side.
+    The medium has no end and the cells of `grid`; `depth` is that along their shortest side.
     """
-    points, weights = (
-        one.numpy() for one in sphere_quadrature(torch.zeros(()).double(), DIRECTIONS[degree])
-    )
+    directions, spacing = count_directions(grid, degree, 2), np.array(grid.spacing)
+    points, weights = (one.numpy() for one in quadrature_of(grid, directions))
     angles = degree if g else 0
     f = max(g, 0.0) ** (degree + 1)
     p = (g ** np.arange(angles + 1) - f) / (1 - f)
@@ -67,11 +62,12 @@ def rounds_of_waves(
     )
     p_1 = p[1] if angles else 0.0
     diffusion = 1 / (3 * (k_t - k_s * p_1))
-    values = harmonics_of(points, angles)
+    *_, values, weighted = sweep_rule(grid, directions, (angles + 1) ** 2)
+    values, weighted = values.numpy(), weighted.numpy()
     of_degrees = np.repeat(p, 2 * np.arange(angles + 1) + 1)
-    one, slope = sweep_of_waves(waves, spacing, points, k_t)
-    swept = k_s * np.einsum("n,wn,nk,nj->wkj", weights, one, values, values * of_degrees)
-    swept[:, :, 0] += k_s * np.einsum("n,wn,nk->wk", weights, slope, values)
+    one, slope = sweep_of_waves(waves, grid, points, k_t)
+    swept = k_s * np.einsum("wn,nk,nj->wkj", one, weighted, values * of_degrees)
+    swept[:, :, 0] += k_s * np.einsum("wn,nk->wk", slope, weighted)
     unit = np.eye(swept.shape[1])
     change = swept - unit
     step = 1 / np.abs(points / spacing).max(1)
@@ -130,6 +126,7 @@ WAVES[0] = 1e-3, 0, 0
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("periodic", [(), (1, 2)], ids=["box", "layer"])
 @pytest.mark.parametrize(
     ("degree", "g"),
     [
@@ -137,14 +134,23 @@ WAVES[0] = 1e-3, 0, 0
         *product((7,), (-0.95, 0.0, 0.95)),
     ],
 )
-def test_a_round_shrinks_every_wave(degree: int, g: float):
+def test_a_round_shrinks_every_wave(degree: int, g: float, periodic: tuple[int, ...]):
     shapes = (
         [CUBES]
         if degree == 7
-        else [CUBES, (1.0, 1.0, 4.0), (1.0, 1.0, 20.0), (20.0, 1.0, 20.0), (0.2, 1.0, 5.0)]
+        else [
+            CUBES,
+            (1.0, 1.0, 4.0),
+            (1.0, 1.0, 20.0),
+            (20.0, 1.0, 20.0),
+            (0.2, 1.0, 5.0),
+            (1.0, 5.0, 5.0),
+        ]
     )
     for spacing, depth, albedo in product(shapes, (0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9999)):
-        matrices, bound = rounds_of_waves(WAVES, np.array(spacing), g, degree, depth, albedo)
+        ends = tuple(2 * side for side in spacing)
+        grid = Grid((2, 2, 2), (0.0,) * 3, ends, periodic=periodic)
+        matrices, bound = rounds_of_waves(WAVES, grid, g, degree, depth, albedo)
         eigenvalues = np.linalg.eigvals(matrices)
         left = float(np.abs(eigenvalues).max()), float(growth(eigenvalues, bound).max())
         assert max(left) < 0.999, (spacing, depth, albedo, left)
