@@ -1,6 +1,6 @@
 """How far images and derivatives are from path-traced ones: tables in Markdown.
 
-    python benchmarks/accuracy.py eleven|derivative|angles|volumes|grounds --references FOLDER
+    python benchmarks/accuracy.py eleven|derivative|angles|volumes|grounds|thick --references FOLDER
 
 `eleven`: the cases of FOLDER/images/cases.json, whose images lie beside it. `derivative`: by all
 the density of some of them, against central differences (FOLDER/fd_gradients.json).
@@ -8,6 +8,11 @@ the density of some of them, against central differences (FOLDER/fd_gradients.js
 by Mitsuba 3 (extra `reference`) and kept there. An error is the relative RMS error of the image in
 linear radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that
 noise.
+
+`thick`: where cells are optically thick, against our own images on a grid six times as fine: the
+same density, linear between the centers of the coarse grid, with angles to degree 5 and five
+rounds. `default` is what a scene file gets; the others have cells as they are, or `a third` as
+wide. Merged balls are lit from the side or the eye; `block` fills its box.
 """
 
 from __future__ import annotations
@@ -18,26 +23,35 @@ import math
 import re
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from figures import print_header, print_row
 from torch import Tensor
+from torch.nn.functional import interpolate
 
-from ddrecon.bench.plume import fade, plume_density
+from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
+from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import render
 from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import RenderSettings
+from ddrecon.validate.hard import fade, plume_density
 from ddrecon.variables.values import with_values
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Density at x, y and z, each from -0.5 to 0.5 across the box."""
 Vector = tuple[float, float, float]
 CELLS, PIXELS = 48, 32
+LIGHT = ("direction", "irradiance", "radiance")
+"""What is taken of the lights of the eleven cases."""
 MODELS = {
     "n = 0": ("diffusion.transport_rounds=0",),
     "n = 1": ("diffusion.transport_rounds=1", "diffusion.degree=3"),
@@ -162,8 +176,19 @@ def write_scene(
     return path
 
 
+BALLS, CLOUDS = (partial(Case, field=field, sigma_t=25.0) for field in (BALL, CLOUD))
+PLUMES = partial(Case, field=plume_density, sigma_t=25.0)
+LAMP = ({"type": "point", "position": [0.9, 0.7, 0.5], "intensity": 3.0},)
+AMBIENT = {"type": "ambient", "radiance": 1.0}
+TALL, ABOVE = (1.0, 1.5, 1.0), perspective((1.3, 1.6, 2.6), 34.0)
+
+
+def half_wide(half_width: float) -> dict[str, Any]:
+    return perspective(FRONT, math.degrees(2 * math.atan(half_width)))
+
+
 ANGLES = tuple(
-    Case(f"{name}, g {g}", CLOUD, 25.0, g=g, light=(sun(travel),), camera=perspective(eye))
+    CLOUDS(f"{name}, g {g}", g=g, light=(sun(travel),), camera=perspective(eye))
     for name, travel, eye in (
         ("lit from the side", SIDE, FRONT),
         ("against the light", (-2.0, -0.4, -2.2), FAR),
@@ -171,85 +196,32 @@ ANGLES = tuple(
     )
     for g in (-0.9, -0.8, -0.4, 0.0, 0.6, 0.8, 0.9)
 )
-LAMP = {"type": "point", "position": [0.9, 0.7, 0.5], "intensity": 3.0}
-AMBIENT = {"type": "ambient", "radiance": 1.0}
+SLAB = {"light": (sun((-0.5, -2.0, -0.7)),), "camera": perspective((0.0, 1.6, 2.8))}
+PARALLEL = {"type": "orthographic", "origin": list(BELOW), "width": 1.4}
+BOTH = ({**AMBIENT, "radiance": 0.3}, sun(SIDE))
 VOLUMES = (
     *(Case(f"ball, depth {depth}", BALL, depth / DEPTH_OF_BALL, 0.99) for depth in (5, 20, 60)),
-    *(
-        Case(f"ball, depth 20, albedo {albedo}", BALL, 20 / DEPTH_OF_BALL, albedo)
-        for albedo in (0.5, 1.0)
-    ),
-    Case(
-        "thin slab",
-        slab,
-        60.0,
-        0.99,
-        light=(sun((-0.5, -2.0, -0.7)),),
-        camera=perspective((0.0, 1.6, 2.8)),
-    ),
+    *(Case(f"ball, depth 20, albedo {a}", BALL, 20 / DEPTH_OF_BALL, a) for a in (0.5, 1.0)),
+    Case("thin slab", slab, 60.0, 0.99, **SLAB),
     Case("small ball off center", SMALL, 60.0, 0.99),
     *(Case(f"thin limbs, g {g}", limbs, 40.0, g=g) for g in (-0.8, 0.85)),
-    Case(
-        "plume, g 0.5",
-        plume_density,
-        25.0,
-        g=0.5,
-        extent=(1.0, 1.5, 1.0),
-        camera=perspective(FRONT, math.degrees(2 * math.atan(0.3))),
-    ),
-    Case("ball, point light", BALL, 25.0, light=(LAMP,)),
-    Case("cloud, ambient light", CLOUD, 25.0, light=(AMBIENT,)),
-    Case(
-        "cloud, ambient light and sun", CLOUD, 25.0, light=({**AMBIENT, "radiance": 0.3}, sun(SIDE))
-    ),
-    Case(
-        "cloud in 2 x 0.5 x 1",
-        CLOUD,
-        25.0,
-        extent=(2.0, 0.5, 1.0),
-        camera=perspective(FRONT, math.degrees(2 * math.atan(0.33))),
-    ),
-    Case(
-        "plume, parallel rays, from below",
-        plume_density,
-        25.0,
-        camera={"type": "orthographic", "origin": list(BELOW), "width": 1.4},
-    ),
+    PLUMES("plume, g 0.5", g=0.5, extent=TALL, camera=half_wide(0.3)),
+    BALLS("ball, point light", light=LAMP),
+    CLOUDS("cloud, ambient light", light=(AMBIENT,)),
+    CLOUDS("cloud, ambient light and sun", light=BOTH),
+    CLOUDS("cloud in 2 x 0.5 x 1", extent=(2.0, 0.5, 1.0), camera=half_wide(0.33)),
+    PLUMES("plume, parallel rays, from below", camera=PARALLEL),
 )
-ABOVE = perspective((1.3, 1.6, 2.6), 34.0)
+GRAY, WHITE, FLOOR = (
+    {"camera": ABOVE, "ground": g} for g in ((-0.6, 0.5), (-0.6, 0.9), (-0.75, 0.5))
+)
 GROUNDS = (
-    Case("cloud over gray ground", CLOUD, 25.0, 0.99, camera=ABOVE, ground=(-0.6, 0.5)),
-    Case(
-        "cloud over white ground, g 0.85", CLOUD, 25.0, 1.0, 0.85, camera=ABOVE, ground=(-0.6, 0.9)
-    ),
-    Case(
-        "cloud over white ground, ambient light",
-        CLOUD,
-        25.0,
-        light=(AMBIENT,),
-        camera=ABOVE,
-        ground=(-0.6, 0.9),
-    ),
-    Case(
-        "ball over gray ground, point light",
-        BALL,
-        25.0,
-        light=(LAMP,),
-        camera=ABOVE,
-        ground=(-0.6, 0.5),
-    ),
-    Case(
-        "plume on gray ground, g 0.5",
-        plume_density,
-        25.0,
-        g=0.5,
-        extent=(1.0, 1.5, 1.0),
-        camera=ABOVE,
-        ground=(-0.75, 0.5),
-    ),
+    CLOUDS("cloud over gray ground", albedo=0.99, **GRAY),
+    CLOUDS("cloud over white ground, g 0.85", albedo=1.0, g=0.85, **WHITE),
+    CLOUDS("cloud over white ground, ambient light", light=(AMBIENT,), **WHITE),
+    BALLS("ball over gray ground, point light", light=LAMP, **GRAY),
+    PLUMES("plume on gray ground, g 0.5", g=0.5, extent=TALL, **FLOOR),
 )
-
-
 CASES = {"angles": ANGLES, "volumes": VOLUMES, "grounds": GROUNDS}
 
 
@@ -279,45 +251,27 @@ def as_seen(error: float, noise: float) -> str:
     return f"{error:.3f}" if error > noise / 3 else f"< {noise / 3:.3f}"
 
 
-def print_row(*cells: object) -> None:
-    print(f"| {' | '.join(map(str, cells))} |", flush=True)
-
-
-def print_header(*names: str) -> None:
-    print_row(*names)
-    print_row(*["---"] * len(names))
-
-
 def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
     """The name, scene file and path-traced image of each of the eleven cases."""
-    found = []
+    cases = []
     for case in json.loads((folder / "images" / "cases.json").read_text()):
         full = np.load(folder / "images" / f"{case['case']}.npz")["full"]
         noise = case["noise_full"] / math.sqrt((full**2).mean())
         medium = {name: float(case[name]) for name in ("sigma_t", "albedo", "g")}
         camera = {name: case["camera"][name] for name in ("origin", "target", "up", "fov")}
         bounds = np.array([[sign * side for side in case["extent"]] for sign in (-0.5, 0.5)])
-        lights = [
-            {"type": "ambient" if light["type"] == "constant" else light["type"]}
-            | {
-                name: light[name]
-                for name in ("direction", "irradiance", "radiance")
-                if name in light
-            }
-            for light in case["light"]
-        ]
-        (place / case["case"]).mkdir()
-        path = write_scene(
-            place / case["case"],
-            folder / "images" / f"{case['volume']}_density.npz",
-            bounds,
-            medium,
-            lights,
-            {"type": "perspective", **camera},
-            case["resolution"],
-        )
-        found.append((case["case"], path, Traced(full, noise)))
-    return found
+        lights = []
+        for light in case["light"]:
+            kind = "ambient" if light["type"] == "constant" else light["type"]
+            numbers = {key: light[key] for key in light if key in LIGHT}
+            lights.append({"type": kind} | numbers)
+        case_folder = place / case["case"]
+        case_folder.mkdir()
+        density = folder / "images" / f"{case['volume']}_density.npz"
+        camera["type"] = "perspective"
+        path = write_scene(case_folder, density, bounds, medium, lights, camera, case["resolution"])
+        cases.append((case["case"], path, Traced(full, noise)))
+    return cases
 
 
 def print_eleven(folder: Path, place: Path) -> None:
@@ -365,10 +319,63 @@ def print_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> None:
         print_row(case.name, f"{traced.noise:.3f}", *errors)
 
 
+THICK_CELLS, FINER = 12, 6
+MERGED = together(around((-0.13, -0.08, 0.05), 0.32, 0.2), around((0.17, 0.1, -0.05), 0.27, 0.2))
+SHOWN: dict[str, tuple[Field, Vector, Vector]] = {
+    "side": (MERGED, SIDE, FRONT),
+    "eye": (MERGED, (2.0, -1.2, 2.2), FAR),
+    "block": (lambda x, y, z: torch.ones_like(x * y * z), (-1.0, -1.2, -1.5), (1.3, 1.1, 2.6)),
+}
+"""By a name, what is lit, the way light travels and the eye."""
+
+
+def by_dial(rounds: int, degree: int, times: int = 1) -> tuple[str, ...]:
+    keys = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    return tuple(f"diffusion.{key}={value}" for key, value in keys.items())
+
+
+THICK_MODELS = {
+    "n = 0": by_dial(0, 1),
+    "n = 1, L = 1": by_dial(1, 1),
+    "n = 1, L = 3": by_dial(1, 3),
+    "n = 3, L = 3": by_dial(3, 3),
+    "n = 1, L = 3, a third": by_dial(1, 3, 3),
+    "n = 3, L = 3, a third": by_dial(3, 3, 3),
+    "default": (),
+}
+"""Overrides by column: n transport rounds of degree L, samples of rays as by default."""
+
+
+def refine(scene: Scene) -> Scene:
+    """`scene` in finer cells, two samples in each."""
+    volume = scene.volume
+    density = interpolate(volume.density[None, None], scale_factor=FINER, mode="trilinear")[0, 0]
+    grid = Grid(tuple(density.shape), volume.grid.lower, volume.grid.upper)
+    finer = Volume(grid, density, volume.sigma_a, volume.sigma_s, volume.phase)
+    return replace(scene, volume=finer, render=RenderSettings(4, 2, 0.0))
+
+
+@torch.no_grad()
+def print_thick(place: Path) -> None:
+    """A row by g, optical depths a cell, and what is lit."""
+    print_header("g", "depth of a cell", "lit from", *THICK_MODELS)
+    for g, depth, lit in product((-0.8, 0.0, 0.6, 0.8), (1.0, 4.0, 8.0), SHOWN):
+        field, travel, eye = SHOWN[lit]
+        sigma_t, camera = depth * THICK_CELLS, perspective(eye, 22.0)
+        path = Case(lit, field, sigma_t, 0.95, g, (sun(travel),), camera).write(place, THICK_CELLS)
+        views = "views.0.camera.resolution=[16, 16]"
+        truth = render(refine(load_scene(path, overrides=(views, *by_dial(5, 5)))))
+        images = (
+            render(load_scene(path, overrides=(views, *model))) for model in THICK_MODELS.values()
+        )
+        errors = (float((image - truth).norm() / truth.norm()) for image in images)
+        print_row(str(g), f"{depth:g}", lit, *(f"{error:.3f}" for error in errors))
+
+
 def main() -> None:
     """Prints what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("eleven", "derivative", *CASES))
+    parser.add_argument("what", choices=("eleven", "derivative", "thick", *CASES))
     parser.add_argument("--references", type=Path, default=Path("references"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -376,6 +383,8 @@ def main() -> None:
             print_eleven(given.references, Path(name))
         elif given.what == "derivative":
             print_derivatives(given.references, Path(name))
+        elif given.what == "thick":
+            print_thick(Path(name))
         else:
             print_cases(CASES[given.what], given.references, Path(name))
 

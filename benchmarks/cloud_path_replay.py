@@ -32,8 +32,10 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
+from figures import print_header, print_row
 from path_replay import DENSITY, Replay, why_not
-from reconstruction import ROOT, coarsened, print_row
+from reconstruction import ROOT, coarsened
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -68,35 +70,17 @@ def write_scene(cloud: Path, folder: Path) -> Path:
         angle, radius = index * math.pi * (3 - math.sqrt(5)), math.sqrt(1 - height**2)
         away = np.array([radius * math.sin(angle), height, radius * math.cos(angle)])
         middle = (low + high) / 2
-        camera = {
-            "type": "perspective",
-            "origin": (middle + 2 * np.linalg.norm(high - low) * away).tolist(),
-            "target": middle.tolist(),
-            "fov": 22,
-            "resolution": [PIXELS, PIXELS],
-        }
+        origin = middle + 2 * np.linalg.norm(high - low) * away
+        camera = {"type": "perspective", "origin": origin.tolist(), "target": middle.tolist()}
+        camera |= {"fov": 22, "resolution": [PIXELS, PIXELS]}
         split = "test" if index % TEST_EVERY == 0 else "train"
         name = f"{split}_{index:02d}"
         views.append({"name": name, "camera": camera, "split": split, "image": f"{name}.npy"})
-    config = load_scene(ROOT / "configs/cloud.yaml", overrides=[f"volume.density.file={cloud}"])
-    lights = [
-        {
-            "type": "directional",
-            "direction": config.lights[0].direction.tolist(),
-            "irradiance": config.lights[0].irradiance.tolist(),
-        },
-        {"type": "ambient", "radiance": config.lights[1].radiance.tolist()},
-    ]
+    medium = {"sigma_t": SIGMA_T, "albedo": 1, "g": G}
+    bounds = {"min": low.tolist(), "max": high.tolist()}
     scene = {
-        "volume": {
-            "bounds": {"min": low.tolist(), "max": high.tolist()},
-            "resolution": list(CELLS),
-            "density": 0,
-            "sigma_t": SIGMA_T,
-            "albedo": 1,
-            "g": G,
-        },
-        "lights": lights,
+        "volume": {"bounds": bounds, "resolution": list(CELLS), "density": 0, **medium},
+        "lights": yaml.safe_load((ROOT / "configs/cloud.yaml").read_text())["lights"],
         "views": views,
         "optimize": {"parameters": {"density": {"init": 0, "min": 0}}},
     }
@@ -136,7 +120,8 @@ def by_path_replay(scene: Scene, rate: float, seconds: float) -> tuple[np.ndarra
     import drjit
 
     chosen = [index for index, view in enumerate(scene.views) if not view.is_test]
-    scene = replace(scene, volume=replace(scene.volume, density=_fill(scene, START)))
+    start = torch.full_like(scene.volume.density, START)
+    scene = replace(scene, volume=replace(scene.volume, density=start))
     replay = Replay.of(scene, 1.0, len(scene.views))
     pictures = {index: scene.views[index].image.movedim(0, -1) for index in chosen}
     wanted = {index: replay.module.TensorXf(image.numpy()) for index, image in pictures.items()}
@@ -168,10 +153,6 @@ def by_path_replay(scene: Scene, rate: float, seconds: float) -> tuple[np.ndarra
             iteration += 1
         value = value.detach()
     return _resize(value, shape).numpy(), iteration
-
-
-def _fill(scene: Scene, number: float) -> Tensor:
-    return torch.full_like(scene.volume.density, number)
 
 
 def _resize(field: Tensor, shape: Any) -> Tensor:
@@ -216,8 +197,7 @@ def main() -> None:
     if not path.exists():
         trace_pictures(write_scene(given.cloud.resolve(), folder), folder)
     scene, truth = load_scene(path), read_field(folder / "truth.npz", "density").values
-    print_row("who", "held out", "L1", "mass", "iterations", "processor s")
-    print_row(*["---"] * 6)
+    print_header("who", "held out", "L1", "mass", "iterations", "processor s")
 
     def judge(who: str, density: np.ndarray, iterations: int, seconds: float) -> None:
         error = float(np.abs(density - truth).sum() / truth.sum())

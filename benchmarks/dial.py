@@ -1,6 +1,6 @@
 """How far images are from published truth, by transport rounds and degree: tables in Markdown.
 
-    python benchmarks/dial.py [--only NAME,...] [-D KEY=VALUE]... [--json]
+    python benchmarks/dial.py [--only NAME,...]
 
 Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
 radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`). `half-space` is
@@ -8,24 +8,22 @@ one cell across, far wider than deep; all others have cubes, and a step cloud re
 much, in percent, the image of a plain box changes from 8 to 16 rounds of degree 3, 5 and 7, in
 cells as they are.
 
-NAME is part of a row's name, `-D` overrides keys of all scenes, `seconds` are those of the default.
-Slabs need PythonicDISORT.
+NAME is part of a row's name; `seconds` are those of the default. Slabs need PythonicDISORT.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from accuracy import print_header, print_row
+from figures import print_header, print_row
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "exact"))
 from published import PHASES, Layer, StepCloud, percent_off, show
@@ -119,17 +117,15 @@ def box(depth: float, g: float, albedo: float) -> dict[str, Any]:
     }
 
 
-def print_layers(
-    layers: dict[str, Layer | StepCloud], overrides: list[str]
-) -> Iterator[dict[str, Any]]:
-    """A row for each layer, with all its numbers; yields them."""
+def print_layers(layers: dict[str, Layer | StepCloud]) -> None:
+    """A row for each layer, with all its numbers."""
     print_header("case", *MODELS, "seconds")
     for name, layer in layers.items():
         truth, seconds = layer.truth(), dict[str, float]()
         errors = dict[str, dict[str, float]]()
         for model in ("default", *MODELS):  # the first is measured when kernels are there
             start = time.perf_counter()
-            found = layer.seen([*overrides, *MODELS[model]])
+            found = layer.seen([*MODELS[model]])
             seconds[model] = time.perf_counter() - start
             errors[model] = {key: percent_off(found[key], wanted) for key, wanted in truth.items()}
         forms = {key: "+.1f" if np.ndim(wanted) == 0 else ".1f" for key, wanted in truth.items()}
@@ -138,35 +134,29 @@ def print_layers(
             for model in MODELS
         )
         print_row(name, *shown, f"{seconds['default']:.2f}")
-        yield {"case": name, "errors": errors, "seconds": seconds}
 
 
-def print_boxes(
-    boxes: Sequence[tuple[float, float, float]], overrides: list[str]
-) -> Iterator[dict[str, Any]]:
+def print_boxes(boxes: Sequence[tuple[float, float, float]]) -> None:
     """A row for each depth, a column for each g: changes from 8 to 16 rounds by degree."""
     degrees, changes = (3, 5, 7), dict[tuple[float, float], dict[float, list[float]]]()
     for numbers in boxes:
         depth, g, albedo = numbers
         row = changes.setdefault((depth, albedo), {}).setdefault(g, [])
         for degree in degrees:
-            kept = [*overrides, "diffusion.refine=1"]
-            few, many = (show(box(*numbers), [*kept, *by_dial(n, degree)]) for n in (8, 16))
+            keys = ([*by_dial(n, degree), "diffusion.refine=1"] for n in (8, 16))
+            few, many = (show(box(*numbers), overrides) for overrides in keys)
             row.append(percent_off(few, many))
     columns = list(dict.fromkeys(g for _, g, _ in boxes))
     print_header("depth of a cell, albedo", *(f"g {g:g}" for g in columns))
     for (depth, albedo), found in changes.items():
         cells = (", ".join(f"{change:.3f}" for change in found.get(g, [])) for g in columns)
         print_row(f"{depth:g}, {albedo:g}", *cells)
-        yield {"depth": depth, "albedo": albedo, "degrees": degrees, "changes": found}
 
 
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="")
-    parser.add_argument("-D", dest="overrides", action="append", default=[])
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     parts = given.only.split(",")
@@ -174,10 +164,10 @@ def main() -> None:
         {name: row for name, row in rows.items() if any(part in name for part in parts)}
         for rows in (LAYERS, BOXES)
     )
-    rows = [*print_layers(layers, given.overrides)] if layers else []
-    rows += [*print_boxes([*boxes.values()], given.overrides)] if boxes else []
-    if given.json:
-        print(json.dumps(rows))
+    if layers:
+        print_layers(layers)
+    if boxes:
+        print_boxes([*boxes.values()])
 
 
 if __name__ == "__main__":

@@ -2,12 +2,13 @@
 
     python benchmarks/figures.py --references FOLDER [NAME]...     all of them, or some
     python benchmarks/figures.py --write                           no measuring: pages anew
+    python benchmarks/figures.py --show NAME                       prints what is stored
 
 A figure is a table that one command prints. What was measured lies in benchmarks/figures.json with
 its commit, day and machine. A page quotes it between `<!-- figure: NAME -->` and
-`<!-- end of figure -->`; a house test compares. Run it on idle cores. Path tracing needs the extra
-`reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds `images/cases.json` of
-the eleven cases.
+`<!-- end of figure -->`, or names it; a house test compares. Run it on idle cores. Path tracing
+needs the extra `reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds
+`images/cases.json` of the eleven cases.
 """
 
 from __future__ import annotations
@@ -30,25 +31,25 @@ COMMANDS = {
     "angles": "python benchmarks/accuracy.py angles --references FOLDER",
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
     "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
-    "thick": "python benchmarks/thick_cells.py",
+    "thick": "python benchmarks/accuracy.py thick",
     "layers": "python benchmarks/dial.py --only step,half,slab,phantom",
     "boxes": "python benchmarks/dial.py --only box",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
-    "rounds": "python benchmarks/rounds.py",
+    "rounds": "python benchmarks/speed.py rounds",
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
     "film": "python benchmarks/reconstruction.py film",
     "replay": "python benchmarks/path_replay.py --paths 4 16",
     "cloud": "python benchmarks/cloud_path_replay.py FOLDER/wdas_cloud_sixteenth.vdb",
-    "engines": "python benchmarks/engines.py",
-    "tangents": "python benchmarks/engines.py --tangents",
-    "launches": "python benchmarks/launches.py",
-    "solvers": "python benchmarks/solver.py",
+    "engines": "python benchmarks/speed.py engines",
+    "tangents": "python benchmarks/speed.py tangents",
+    "launches": "python benchmarks/launches.py --as-a-gpu --engines warp",
+    "solvers": "python benchmarks/speed.py solvers",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
     "gpu": "python benchmarks/gpu_check.py speed",
-    "scale": "python benchmarks/scaling.py",
+    "scale": "python benchmarks/speed.py scale",
     "speed": "ddrecon bench --quick",
     "hard": "ddrecon bench --hard",
     "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
@@ -56,11 +57,12 @@ COMMANDS = {
     "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
     "pyshdom": "python benchmarks/pyshdom.py FOLDER/pyshdom",
+    "mouse": "python benchmarks/mouse.py FOLDER/mouse",
 }
 """By the name of a figure, what prints it."""
 KEPT_BY_THEMSELVES = ("fig10", "paper")
 """Scripts that keep their tables: the paper's, of one experiment or of all."""
-COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb"}
+COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb", "mouse": "mouse"}
 """Figures of what licenses keep out of here, and its place in FOLDER: measured where it is."""
 SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
@@ -138,6 +140,18 @@ def ask_git(*words: str) -> str:
     ).stdout.strip()
 
 
+def print_row(*cells: object) -> None:
+    """Prints a row of a table."""
+    shown = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
+    print(f"| {' | '.join(shown)} |", flush=True)
+
+
+def print_header(*names: str) -> None:
+    """Prints the head of a table."""
+    print_row(*names)
+    print_row(*["---"] * len(names))
+
+
 def split_row(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip().strip("|").split("|")]
 
@@ -194,7 +208,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--show", choices=[*COMMANDS])
     given = parser.parse_args()
+    if given.show:
+        print(show(given.show, read_store()))
+        return
     references = given.references.resolve()
     absent = [name for name, place in COPIED.items() if not (references / place).exists()]
     absent += [] if shutil.which("nvidia-smi") else ["gpu"]

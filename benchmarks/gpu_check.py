@@ -25,11 +25,10 @@ from statistics import median
 from typing import Any
 
 import torch
-from scaling import start_run
+from speed import start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from ddrecon.bench.plume import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError, SceneError
@@ -40,6 +39,7 @@ from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.validate.hard import plume_scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 ROOT = Path(__file__).parents[1]
@@ -270,11 +270,11 @@ def graphs(check: Check) -> Iterator[str]:
             torch.manual_seed(0)
             run = check.runs()[name]()
             if is_plain:
-                run.frame.replays.new_recorder = None
+                run.frames[0].replays.new_recorder = None
             taken = [check.time_of(run.step, 1) for _ in range(6)]
             ends.append(run.parameters[0].value.detach())
             seconds.append(median(taken[1:]))
-        is_recorded = run.frame.replays.recording is not None
+        is_recorded = run.frames[0].replays.recording is not None
         apart = float((ends[0] - ends[1]).norm() / ends[0].norm())
         yield (
             f"{name}: {seconds[0]:.4f} s plainly, {seconds[1]:.4f} s replayed "

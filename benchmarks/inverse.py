@@ -1,6 +1,6 @@
 """The inverse problem by defaults alone: how near known volumes come, a row for each scene.
 
-    python benchmarks/inverse.py [-o FOLDER] [--only NAME ...] [--references FOLDER] [--quick]
+    python benchmarks/inverse.py [-o FOLDER] [--only NAME ...] [--references FOLDER]
 
 Every run is a process of its own, `ddrecon optimize`, of one thread unless OMP_NUM_THREADS says
 more. Configs are taken as they are; other scenes say what is known of them and no setting
@@ -28,16 +28,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from figures import print_header, print_row
 from inverse_scenes import BUILDERS, perspective, render_views
 from pyshdom import write_scene
-from reconstruction import ROOT, coarsened, print_row
+from reconstruction import ROOT, coarsened
 
 from ddrecon.io.volumes.table import read_field
 
 FRAME = 2
 """The frame of the film that is compared; frames begin with 0."""
-FEW = ("--iterations", "2")
-"""Of a first try."""
 FIELDS = ("density", "emission")
 COLUMNS = {
     "l1": "{:.3f}",
@@ -119,14 +118,14 @@ def write_pyshdom(copy: Path, folder: Path) -> None:
     (folder / "scene.yaml").write_text(json.dumps(scene, indent=1))
 
 
-def prepare(name: str, folder: Path, references: Path | None, fewer: int) -> Task | None:
+def prepare(name: str, folder: Path, references: Path | None) -> Task | None:
     """The task `name`, its scene in `folder` unless it is there already; None without its files."""
     if name in CONFIGS:
         return CONFIGS[name]
     scene, source = folder / "scene.yaml", references and references / name.partition("_masked")[0]
     if name in BUILDERS:
         if not scene.exists():
-            BUILDERS[name](fewer).write(folder)
+            BUILDERS[name]().write(folder)
         return Task(scene, folder / "truth.npz")
     if source is None or not source.exists():
         return None
@@ -196,45 +195,27 @@ def measure(task: Task, run: Path, options: list[str]) -> Row:
     return row | {"memory [MiB]": [used.ru_maxrss / 1024]}
 
 
-def show(name: str, row: Row, before: Row) -> None:
-    """Prints a row, and in parentheses that of another run."""
-    cells = []
-    for column, form in COLUMNS.items():
-        now, then = (", ".join(form.format(x) for x in r.get(column, ())) for r in (row, before))
-        cells.append(f"{now} ({then})" if then else now)
-    print_row(name, *cells)
-
-
 def main() -> None:
-    """Runs the scenes that the command line asks for, and keeps their rows beside earlier ones."""
+    """Runs the scenes that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, help="of scenes and runs; kept if given")
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=NAMES, default=NAMES)
     parser.add_argument("--references", type=Path, help="has views_cloud/ and a copy of pyshdom/")
-    parser.add_argument("--json", type=Path, help="where rows are kept: FOLDER/inverse.json")
-    parser.add_argument("--beside", type=Path, help="rows to print in parentheses, of a --json")
-    parser.add_argument("--scenes", action="store_true", help="write scenes and run none")
-    parser.add_argument("--quick", action="store_true", help="half the cells and few iterations")
     parser.add_argument("-D", dest="keys", action="append", default=[], metavar="KEY=VALUE")
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     folder = (given.output or Path(tempfile.mkdtemp())).resolve()
-    file = given.json or folder / "inverse.json"
-    before = json.loads(given.beside.read_text()) if given.beside else {}
-    options = [*(FEW if given.quick else ()), *(word for key in given.keys for word in ("-D", key))]
-    print_row("scene", *COLUMNS)
-    print_row(*["---"] * (1 + len(COLUMNS)))
+    options = [word for key in given.keys for word in ("-D", key)]
+    print_header("scene", *COLUMNS)
     for name in given.only:
         references = given.references and given.references.resolve()
-        place = folder / name
-        task = prepare(name, place, references, 2 if given.quick else 1)
+        task = prepare(name, folder / name, references)
         if task is None:
             print(f"{name}: not among the references", file=sys.stderr)
-        elif not given.scenes:
-            row = measure(task, place / "run", options)
-            show(name, row, before.get(name, {}))
-            rows = json.loads(file.read_text()) if file.exists() else {}
-            file.write_text(json.dumps(rows | {name: row}, indent=1))
+        else:
+            row = measure(task, folder / name / "run", options)
+            forms = COLUMNS.items()
+            print_row(name, *(", ".join(map(f.format, row.get(column, ()))) for column, f in forms))
 
 
 if __name__ == "__main__":

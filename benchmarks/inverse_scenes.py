@@ -158,29 +158,29 @@ def cloud_optics(sigma_t: float) -> dict[str, Any]:
     return {"up": "z", "sigma_t": sigma_t, "albedo": 1, "g": 0.85}
 
 
-def cumuli(fewer: int) -> Case:
+def cumuli() -> Case:
     """Three cumuli on 32 x 37 x 26 cells, by five cameras from above; two are held out.
 
     Below them the box is empty, where no view sees it.
     """
-    bounds, times = box([0, 0, 0], [0.64, 0.74, 1.04]), 3 // fewer
-    points = centers(bounds, [n // fewer * times for n in (32, 37, 26)])
+    bounds, times = box([0, 0, 0], [0.64, 0.74, 1.04]), 3
+    points = centers(bounds, [n * times for n in (32, 37, 26)])
     places = [(0.24, 0.27, 0.18, 0.46), (0.42, 0.48, 0.15, 0.4), (0.2, 0.56, 0.1, 0.2)]
     reach = np.max([dome(points, x, y, 0.4, *size) for x, y, *size in places], 0)
     middle = [0.32, 0.37, 0.52]
     above = [(-0.5, 0, 1.35), (-0.25, 0.1, 1.4), (0, -0.1, 1.45), (0.25, 0.1, 1.4), (0.5, 0, 1.35)]
     eyes = [(f"train_{number}", eye, [0, 1, 0]) for number, eye in enumerate(above)]
     eyes += [("test_0", (0.1, 0.5, 1.3), [0, 1, 0]), ("test_1", (1.5, 0.4, 0.6), [0, 0, 1])]
-    look = {"fov": 36, "resolution": [40 // fewer] * 2}
+    look = {"fov": 36, "resolution": [40] * 2}
     views = [perspective(name, middle, eye, up=up, **look) for name, eye, up in eyes]
     density = droplets(points, reach, 0.4, 0.4, seed=3)
     return Case({"density": density}, times, bounds | cloud_optics(120), sun(0.15, 0.1, -1), views)
 
 
-def stratocumulus(fewer: int) -> Case:
+def stratocumulus() -> Case:
     """A patch of a layer on 32 x 32 x 12 cells, of optical depth 8 where it is."""
-    bounds, times = box([0, 0, 0.5], [1.6, 1.6, 0.86]), 3 // fewer
-    points = centers(bounds, [n // fewer * times for n in (32, 32, 12)])
+    bounds, times = box([0, 0, 0.5], [1.6, 1.6, 0.86]), 3
+    points = centers(bounds, [n * times for n in (32, 32, 12)])
     waves = turbulence(points, 5).mean(0, keepdims=True)
     top = 0.7 + 0.04 * waves / waves.std()
     inland = 0.7 - np.linalg.norm(points[..., :2] - 0.8, axis=-1)
@@ -188,19 +188,19 @@ def stratocumulus(fewer: int) -> Case:
     density = droplets(points, reach, 0.56, 0.2, seed=6)
     columns = density.sum(0) * 0.36 / len(density)
     medium = bounds | cloud_optics(round(float(8 / columns[columns > 0].mean()), 1))
-    views = along_track([0.8, 0.8, 0.68], 1.7, 40 // fewer)
+    views = along_track([0.8, 0.8, 0.68], 1.7, 40)
     return Case({"density": density}, times, medium, sun(0.4, 0.3, -0.87), views)
 
 
-def at3d(depth: int, fewer: int) -> Case:
+def at3d(depth: int) -> Case:
     """A stochastic cumulus in 1 km^3, cells of 40 m, nine views of 35 m a pixel: AT3D's protocol
     (doi:10.5194/amt-16-3931-2023). Its densest column has the optical `depth`.
     """
-    bounds, times = box([0, 0, 0], [1, 1, 1]), 3 // fewer
-    points = centers(bounds, [25 // fewer * times] * 3)
+    bounds, times = box([0, 0, 0], [1, 1, 1]), 3
+    points = centers(bounds, [25 * times] * 3)
     density = droplets(points, dome(points, 0.5, 0.5, 0.2, 0.36, 0.6), 0.2, 0.5, seed=11)
     sigma_t = depth / (density.sum(0).max() / len(density))
-    views = along_track([0.5, 0.5, 0.5], 1.4, 40 // fewer)
+    views = along_track([0.5, 0.5, 0.5], 1.4, 40)
     medium = bounds | cloud_optics(round(float(sigma_t), 3))
     return Case({"density": density}, times, medium, sun(0.35, 0.35, -0.87), views)
 
@@ -217,10 +217,10 @@ def ring(count: int, distance: float, **camera: Any) -> list[View]:
     return [perspective(name, (0, 0, 0), eye, **camera) for name, eye in eyes]
 
 
-def solid(fewer: int) -> Case:
+def solid() -> Case:
     """A sitting animal of ellipsoids with sharp edges, on 64 x 96 x 64 cells, by ten views."""
-    bounds, times = box([-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]), 2 // fewer
-    points = centers(bounds, [n // fewer * times for n in (64, 96, 64)])
+    bounds, times = box([-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]), 2
+    points = centers(bounds, [n * times for n in (64, 96, 64)])
     blobs = [  # x, y, z, radii, and how far each leans along x
         ((0.03, -0.34, 0), (0.31, 0.27, 0.25), 0.0),
         ((-0.2, 0.06, 0), (0.17, 0.16, 0.14), 0.0),
@@ -235,30 +235,29 @@ def solid(fewer: int) -> Case:
         away = points - middle
         away[..., 0] -= lean * away[..., 1]
         density[np.linalg.norm(away / radii, axis=-1) < 1] = 1
-    views = ring(10, 3.2, resolution=[128 // fewer] * 2)
+    views = ring(10, 3.2, resolution=[128] * 2)
     medium = bounds | {"sigma_t": 20, "albedo": 0.95, "g": 0.3}
     return Case({"density": density}, times, medium, sun(-2, -2, -1), views)
 
 
-def glowing_ball(sigma_t: float, fewer: int) -> Case:
+def glowing_ball(sigma_t: float) -> Case:
     """A ball of 32^3 cells that glows in the sun: its emission is sought beside its density."""
-    bounds, times = box([-0.5] * 3, [0.5] * 3), 3 // fewer
-    points = centers(bounds, [32 // fewer * times] * 3)
+    bounds, times = box([-0.5] * 3, [0.5] * 3), 3
+    points = centers(bounds, [32 * times] * 3)
     radius = np.linalg.norm(points, axis=-1)
     density = 1 / (1 + np.exp((radius - 0.33) / 0.01))
     spot = np.linalg.norm(points - (0.12, 0.1, -0.08), axis=-1)
     glow = 0.85 * np.exp(-((radius / 0.24) ** 2)) + 1.2 * np.exp(-((spot / 0.1) ** 2))
-    views = ring(8, 2.8, resolution=[48 // fewer] * 2)
+    views = ring(8, 2.8, resolution=[48] * 2)
     medium = bounds | {"sigma_t": sigma_t, "albedo": 0.7, "g": 0.4}
     fields = {"density": density, "emission": density * glow}
     return Case(fields, times, medium, sun(-0.5, -0.8, -0.33), views)
 
 
-BUILDERS: dict[str, Callable[[int], Case]] = {
+BUILDERS: dict[str, Callable[[], Case]] = {
     "cumuli": cumuli,
     "solid": solid,
     "stratocumulus": stratocumulus,
     **{f"ball_glows_{depth}": partial(glowing_ball, depth) for depth in (4, 10, 15)},
     **{f"at3d_{depth}": partial(at3d, depth) for depth in DEPTHS},
 }
-"""By name; what is built takes into how many parts the cells of a first try are fewer, 1 or 2."""

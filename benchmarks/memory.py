@@ -18,33 +18,29 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import torch
+from figures import print_header, print_row
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 SMALL = 16
-SCENE = {
-    "volume": {
-        "bounds": {"min": [-0.5] * 3, "max": [0.5] * 3},
-        "density": 1,
-        "sigma_t": 20,
-        "g": 0.0,
-    },
-    "lights": [{"type": "directional", "direction": [-2, -2, -1], "irradiance": 3.14159}],
+RGB = {"albedo": [0.95, 0.9, 0.8]}
+BOTH = {"sigma_a": [1.0, 2.0, 4.0], "sigma_s": [19.0, 18.0, 16.0]}
+ONE_ROUND = {"transport_rounds": 1, "degree": 3}
+CASES: dict[str, tuple[dict[str, object], dict[str, object], tuple[str, ...]]] = {
+    "gray": ({}, {}, ()),
+    "RGB": (RGB, {}, ()),
+    "RGB, g 0.3": (RGB | {"g": 0.3}, {}, ()),
+    "RGB, g 0.3, one round": (RGB | {"g": 0.3}, ONE_ROUND, ()),
+    "RGB, g 0.3, degree 5": (RGB | {"g": 0.3}, ONE_ROUND | {"degree": 5}, ()),
+    "RGB, flux-limited": (RGB, {"model": "flux_limited"}, ()),
+    "RGB fields": (RGB, {}, ("albedo",)),
+    "density, sigma_a and sigma_s": (BOTH, {}, ("sigma_a", "sigma_s")),
+    "density, sigma_a and sigma_s, g 0.3": (BOTH | {"g": 0.3}, {}, ("sigma_a", "sigma_s")),
 }
-CAMERA = {"type": "perspective", "target": [0, 0, 0], "up": [0, 1, 0], "fov": 28}
-CASES = {
-    "gray": {},
-    "RGB": {"albedo": [0.95, 0.9, 0.8]},
-    "RGB, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3},
-    "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1, "degree": 3},
-    "RGB, g 0.3, degree 5": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1, "degree": 5},
-    "RGB, flux-limited": {"albedo": [0.95, 0.9, 0.8], "model": "flux_limited"},
-    "RGB fields": {"albedo": [0.95, 0.9, 0.8], "fields": True},
-    "density, sigma_a and sigma_s": {"albedo": [0.95, 0.9, 0.8], "joint": True},
-    "density, sigma_a and sigma_s, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "joint": True},
-}
+"""What is said of the medium and of diffusion, and the fields that are sought beside density."""
 SOLVE = """
 import sys, torch
 from pathlib import Path
@@ -57,39 +53,29 @@ torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse[0].sum(), density)
 """
 
 
-def scene_of(
-    cells: int, pixels: int, case: dict[str, object], is_optimized: bool
-) -> dict[str, object]:
-    """A scene file's contents: one view."""
-    volume = {
-        **SCENE["volume"],
-        "resolution": [cells] * 3,
-        "albedo": case.get("albedo", 0.9),
-        "g": case.get("g", 0.0),
-    }
-    views = [
-        {"name": "view", "camera": {**CAMERA, "origin": [0, 0.3, 3.2], "resolution": [pixels] * 2}}
-    ]
-    scene = {**SCENE, "volume": volume, "views": views}
-    scene["diffusion"] = {
-        "transport_rounds": case.get("rounds", 0),
-        "degree": case.get("degree"),
-        "model": case.get("model", "p1"),
-        "tolerance": 1e-2,
+def write_scene(folder: Path, cells: int, pixels: int, title: str, is_optimized: bool) -> Path:
+    """The file of a scene of one view of the case `title`, in `folder`."""
+    medium, diffusion, fields = CASES[title]
+    optics = {} if "sigma_a" in medium else {"sigma_t": 20, "albedo": 0.9}
+    box = {"bounds": {"min": [-0.5] * 3, "max": [0.5] * 3}, "resolution": [cells] * 3}
+    camera = {"type": "perspective", "origin": [0, 0.3, 3.2], "target": [0, 0, 0]}
+    view = {"name": "view", "camera": camera | {"fov": 28, "resolution": [pixels] * 2}}
+    plain = {"transport_rounds": 0, "model": "p1", "tolerance": 1e-2}
+    scene: dict[str, object] = {
+        "volume": {**box, "density": 1, "g": 0.0, **optics, **medium},
+        "lights": [{"type": "directional", "direction": [-2, -2, -1], "irradiance": 3.14159}],
+        "views": [view],
+        "diffusion": plain | diffusion,
     }
     if is_optimized:
-        scene["views"] = [{**views[0], "image": "view.npy", "split": "train"}]
-        parameters: dict[str, object] = {"density": {"init": 1}}
-        if case.get("fields"):
-            parameters["albedo"] = {"init": 0.9, "field": True}
-        if case.get("joint"):
-            del volume["sigma_t"], volume["albedo"]
-            volume |= {"sigma_a": [1.0, 2.0, 4.0], "sigma_s": [19.0, 18.0, 16.0]}
-            parameters |= {
-                name: {"init": volume[name], "field": True} for name in ("sigma_a", "sigma_s")
-            }
-        scene["optimize"] = {"iterations": 20, "parameters": parameters}
-    return scene
+        np.save(folder / "view.npy", np.full((pixels, pixels, 3), 0.1, np.float32))
+        scene["views"] = [view | {"image": "view.npy", "split": "train"}]
+        starts = {name: 0.9 if name == "albedo" else medium[name] for name in fields}
+        parameters = {name: {"init": start, "field": True} for name, start in starts.items()}
+        scene["optimize"] = {"iterations": 20, "parameters": {"density": {"init": 1}, **parameters}}
+    path = folder / "scene.yaml"
+    path.write_text(json.dumps(scene))
+    return path
 
 
 def peak(command: list[str]) -> int:
@@ -136,19 +122,14 @@ def place() -> str:
     return f"{frame.f_code.co_filename.partition('/ddrecon/')[2]}, `{frame.f_code.co_name}`"
 
 
-def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, float, str]:
+def count(folder: Path, cells: int, title: str) -> tuple[float, float, str]:
     """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
-    import numpy as np
-
     from ddrecon.diffusion.implicit import SolveMemory
     from ddrecon.picture import render_each
     from ddrecon.reconstruct.loop import Reconstruction
     from ddrecon.scene_file.build import load_scene
 
-    np.save(folder / "view.npy", np.full((16, 16, 3), 0.1, np.float32))
-    path = folder / "scene.yaml"
-    path.write_text(json.dumps(scene_of(cells, 16, case, is_optimized=True)))
-    scene = load_scene(path)
+    scene = load_scene(write_scene(folder, cells, 16, title, is_optimized=True))
     with Alive() as render, torch.no_grad():
         scene.volume.density = scene.volume.density.clone()
         render_each(scene, scene.views, SolveMemory())
@@ -160,66 +141,47 @@ def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, flo
     return *numbers, iteration.where
 
 
-def measure(
-    folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]
-) -> tuple[int, int]:
+def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tuple[int, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
-    import numpy as np
-
-    np.save(folder / "view.npy", np.full((pixels, pixels, 3), 0.1, np.float32))
-    path = folder / "scene.yaml"
-    path.write_text(json.dumps(scene_of(cells, pixels, case, verb == "optimize")))
+    path = str(write_scene(folder, cells, pixels, title, verb == "optimize"))
     program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
-    found = subprocess.run(
-        [*program, "check", str(path), "--json"], capture_output=True, text=True, check=True
-    )
+    check = [*program, "check", path, "--json"]
+    told = subprocess.run(check, capture_output=True, text=True, check=True).stdout
+    command = [*program, verb, path, "-o", str(folder / verb), "--overwrite", "-q"]
     if verb == "solve":
-        command = [sys.executable, "-c", SOLVE, str(path)]
-    else:
-        command = [*program, verb, str(path), "-o", str(folder / verb), "--overwrite", "-q"]
-    return peak(command), int(json.loads(found.stdout)["memory_bytes"])
+        command = [sys.executable, "-c", SOLVE, path]
+    return peak(command), int(json.loads(told)["memory_bytes"])
 
 
 def main() -> None:
     """Prints a table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
-    parser.add_argument("--pixels", type=int, default=256)
-    parser.add_argument("--scene", choices=CASES, nargs="*", default=list(CASES))
     parser.add_argument("--count", action="store_true")
-    arguments = parser.parse_args()
-    if arguments.count:
-        print("| scene | render | iteration | at its peak |\n|---|---|---|---|")
-        with tempfile.TemporaryDirectory() as name:
-            count(Path(name), 48, CASES["gray"])  # what is made once for a grid does not count
-        for title in arguments.scene:
-            with tempfile.TemporaryDirectory() as name:
-                render, iteration, where = count(Path(name), 48, CASES[title])
-            print(f"| {title} | {render:.0f} | {iteration:.0f} | {where} |", flush=True)
-        return
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        print(
-            "| scene | cells | solve, there and back [bytes per cell and color] | command | peak "
-            "[MiB] | predicted / peak |"
-        )
-        print(f"|{'---|' * 6}")
-        for title, case in ((title, CASES[title]) for title in arguments.scene):
-            bases = {
-                verb: measure(folder, verb, SMALL, 16, case)[0]
-                for verb in ("solve", "render", "optimize")
-            }
-            for cells in arguments.cells:
-                solve = measure(folder, "solve", cells, 16, case)[0] - bases["solve"]
-                each = solve / (cells**3 - SMALL**3) / (3 if "albedo" in case else 1)
-                for verb in ("render", "optimize"):
-                    found, predicted = measure(folder, verb, cells, arguments.pixels, case)
-                    used = found - bases[verb]
-                    print(
-                        f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | "
-                        f"{predicted / used:.2f} |",
-                        flush=True,
-                    )
+        if given.count:
+            print_header("scene", "render", "iteration", "at its peak")
+            count(folder, 48, "gray")  # what is made once for a grid does not count
+            for title in CASES:
+                render, iteration, where = count(folder, 48, title)
+                print_row(title, f"{render:.0f}", f"{iteration:.0f}", where)
+            return
+        solved = "solve, there and back [bytes per cell and color]"
+        print_header("scene", "cells", solved, "command", "peak [MiB]", "predicted / peak")
+        for title, (medium, *_) in CASES.items():
+            verbs = ("solve", "render", "optimize")
+            bases = {verb: measure(folder, verb, SMALL, 16, title)[0] for verb in verbs}
+            colors = 3 if {"albedo", "sigma_a"} & {*medium} else 1
+            for cells in given.cells:
+                solve = measure(folder, "solve", cells, 16, title)[0] - bases["solve"]
+                number = solve / (cells**3 - SMALL**3) / colors
+                for verb in verbs[1:]:
+                    taken, predicted = measure(folder, verb, cells, 256, title)
+                    used = taken - bases[verb]
+                    parts = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
+                    print_row(title, f"{cells}^3", f"{number:.0f}", verb, *parts)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,15 @@
 """Remakes the experiments of docs/experiments.md: runs them through the command line, draws their
 pictures, rewrites the table.
 
-    python benchmarks/paper.py [NAME]... [-o FOLDER] [--size paper] [--keep]
+    python benchmarks/paper.py [NAME]... [-o FOLDER] [--keep]
 
 NAME is that of a config in configs/paper; without one, all are remade, Fig. 7 and 8 too where
-Mitsuba can run. `--size paper` path-traces pictures of the paper's size first and runs as many
-cells and iterations as the paper did (or `--iterations`), which wants a GPU; its figures are
-printed, and docs/ is left alone. `--keep` draws finished runs again.
+Mitsuba can run. `--keep` draws finished runs again.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -23,17 +19,18 @@ import numpy as np
 import paper_gradients
 import paper_path_replay
 import path_replay
-import yaml
-from paper_figures import Log, draw, pace, read_log
-from paper_page import (
+from figures import keep, read_store
+from paper_figures import (
     CONFIGS,
     PICTURES,
     ROOT,
     SHAPES,
+    Log,
     as_options,
     ddrecon,
-    read_table,
-    rewrite_table,
+    draw,
+    pace,
+    read_log,
 )
 from paper_shown import (
     Run,
@@ -42,7 +39,6 @@ from paper_shown import (
     draw_parts,
     draw_rounds,
     first,
-    shape,
     show_density,
     show_derivatives,
     show_four,
@@ -52,36 +48,24 @@ from paper_shown import (
     show_smoke,
 )
 
-from ddrecon.io.volumes.table import write_field
-
-SCRIPT = Path(__file__).name
-PAPER_PIXELS, PAPER_CELLS = 512, 192
-CUBE = np.array([[-0.5] * 3, [0.5] * 3])
 TOP = (
     "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | "
-    "loss | PSNR shown, novel | found |\n"
-    "|---|---|---|---|---|---|---|\n"
+    "loss | PSNR shown, novel | found |",
+    "|---|---|---|---|---|---|---|",
 )
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """How the config `name` is run: by `variants`, names of runs with their overrides, and at the
-    paper's size with `paper_size` besides.
+    """How a config is run: by `variants`, names of runs with their overrides.
 
-    `truth` names the folder of data/paper its pictures are in, if they are path-traced. `shown`
-    makes the pairs to draw and says what was found. `others` are variants too, of the small size
-    alone, whose logs are not drawn; `draw_more` makes further pictures of them all. `known` names
-    the shape whose density is given, which at the paper's size is interpolated to its cells.
+    `shown` makes the pairs to draw and says what was found. `others` are variants too, whose logs
+    are not drawn; `draw_more` makes further pictures of them all.
     """
 
-    name: str
-    truth: str
     shown: Shown
-    paper_size: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"": ()})
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    known: str = ""
     draw_more: Callable[[Runs], None] = lambda runs: None
 
 
@@ -101,79 +85,20 @@ ROUNDS = {
     "half_printed": (*HALF, "diffusion.scheme=printed"),
 }
 PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
-FINE = "volume.resolution=[192, 192, 192]"
-EXPERIMENTS = (
-    Experiment(
-        "fig13",
-        "fig13",
-        show_density("bunny", "ring_00"),
-        ("optimize.iterations=1000",),
-        others=ROUNDS,
-        draw_more=draw_rounds,
-    ),
-    Experiment("fig06_light", "fig06_light", show_light, ("optimize.iterations=100",)),
-    Experiment("fig06_density", "knot", show_density("knot", "front")),
-    Experiment(
-        "fig10",
-        "fig10",
-        show_optics,
-        ("optimize.iterations=3000",),
-        others={"g_alone": G_ALONE},
-        known="cloud",
-    ),
-    Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
-    Experiment("fig12_four", "smoke", show_four, (FINE,)),
-    Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),
-    Experiment(
-        "fig14", "", show_photograph, (FINE, f"views.0.image={ROOT}/data/cumulus/cumulus.webp")
-    ),
-)
-"""In the order of docs/experiments.md."""
+EXPERIMENTS = {
+    "fig13": Experiment(show_density("bunny", "ring_00"), others=ROUNDS, draw_more=draw_rounds),
+    "fig06_light": Experiment(show_light),
+    "fig06_density": Experiment(show_density("knot", "front")),
+    "fig10": Experiment(show_optics, others={"g_alone": G_ALONE}),
+    "fig12_single": Experiment(show_smoke),
+    "fig12_four": Experiment(show_four),
+    "fig09": Experiment(show_derivatives, PARTS, draw_more=draw_parts),
+    "fig14": Experiment(show_photograph),
+}
+"""By their configs, in the order of docs/experiments.md."""
 
 
-def optimize(name: str, folder: Path, overrides: list[str]) -> Run:
-    """Runs the config `name` into `folder`, and renders what it found."""
-    ddrecon("optimize", CONFIGS / f"{name}.yaml", "-o", folder, *as_options(overrides))
-    ddrecon("render", folder, "-o", folder / "views")
-    return Run(name, folder)
-
-
-def at_paper_size(
-    experiment: Experiment, output: Path, iterations: int | None, paths: int | None
-) -> list[str]:
-    """Overrides for the paper's size, its pictures traced by so many `paths`, and `iterations`."""
-    fewer = () if iterations is None else (f"optimize.iterations={iterations}",)
-    size = [*experiment.paper_size, *fewer]
-    if experiment.known:
-        output.mkdir(parents=True, exist_ok=True)
-        path = output / f"{experiment.known}.npz"
-        write_field(path, "density", shape(experiment.known, np.empty(3 * [PAPER_CELLS])), CUBE)
-        size.append(f"volume.density={{file: {path.resolve()}}}")
-    if not experiment.truth:
-        return size
-    traced, views = (
-        output / "targets",
-        yaml.safe_load((CONFIGS / f"{experiment.name}.yaml").read_text())["views"],
-    )
-    options = [
-        "--pixels",
-        str(PAPER_PIXELS),
-        "-o",
-        traced,
-        *([] if paths is None else ["--paths", str(paths)]),
-    ]
-    subprocess.run(
-        [sys.executable, ROOT / "data" / "make_targets.py", experiment.truth, *options], check=True
-    )
-    images = {
-        index: traced.resolve() / experiment.truth / Path(view["image"]).name
-        for index, view in enumerate(views)
-        if "image" in view
-    }
-    return [*(f"views.{index}.image={image}" for index, image in images.items()), *size]
-
-
-def row(experiment: Experiment, log: Log, words: str) -> str:
+def row(name: str, log: Log, words: str) -> str:
     """A line of the table: what the first variant took and found."""
     tenth = max(len(log["loss"]) // 10, 1)
     seconds, ends = pace(log), (slice(tenth), slice(-tenth, None))
@@ -184,52 +109,27 @@ def row(experiment: Experiment, log: Log, words: str) -> str:
     )
     losses = " to ".join(f"{log['loss'][end]:.2g}" for end in (0, -1))
     quality = ", ".join(
-        "-" if np.isnan(log[name][-1]) else f"{log[name][-1]:.1f} dB"
-        for name in ("psnr", "test_psnr")
+        "-" if np.isnan(log[column][-1]) else f"{log[column][-1]:.1f} dB"
+        for column in ("psnr", "test_psnr")
     )
-    return (
-        f"| {experiment.name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | "
-        f"{words} |\n"
-    )
+    return f"| {name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | {words} |"
 
 
-def merge_rows(rows: dict[str, str]) -> None:
-    """Puts `rows` into the table of docs/experiments.md, in place of those of the same names."""
-    lines = read_table(SCRIPT).removeprefix(TOP).splitlines(keepends=True)
-    merged = {
-        line.split(" | ")[0].removeprefix("| "): line for line in lines if line.strip()
-    } | rows
-    rewrite_table(
-        SCRIPT,
-        TOP
-        + "".join(
-            merged[experiment.name] for experiment in EXPERIMENTS if experiment.name in merged
-        ),
-    )
-
-
-def remake(
-    experiment: Experiment, output: Path, overrides: list[str], is_small: bool, is_kept: bool
-) -> str:
-    """Runs `experiment` unless `is_kept` and done, draws it, and returns its line of the table."""
-    runs = {}
-    variants = {**experiment.variants, **experiment.others} if is_small else experiment.variants
-    for variant in variants:
-        folder = output / (f"{experiment.name}_{variant}" if variant else experiment.name)
-        is_done = is_kept and (folder / "summary.json").exists()
-        runs[variant or "default"] = (
-            Run(experiment.name, folder)
-            if is_done
-            else optimize(experiment.name, folder, [*overrides, *variants[variant]])
-        )
+def remake(name: str, output: Path, is_kept: bool) -> str:
+    """Runs the experiment `name` unless `is_kept` and done, draws it, and returns its row."""
+    experiment, runs = EXPERIMENTS[name], dict[str, Run]()
+    for variant, overrides in {**experiment.variants, **experiment.others}.items():
+        folder = output / (f"{name}_{variant}" if variant else name)
+        if not (is_kept and (folder / "summary.json").exists()):
+            options = as_options(overrides)
+            ddrecon("optimize", CONFIGS / f"{name}.yaml", "-o", folder, *options)
+            ddrecon("render", folder, "-o", folder / "views")
+        runs[variant or "default"] = Run(folder)
     pairs, words = experiment.shown(runs)
-    logs = {
-        name: read_log(run.folder) for name, run in runs.items() if name not in experiment.others
-    }
-    draw((PICTURES if is_small else output) / f"{experiment.name}.png", pairs, logs)
-    if is_small:
-        experiment.draw_more(runs)
-    return row(experiment, read_log(first(runs).folder), words)
+    logs = {key: read_log(run.folder) for key, run in runs.items() if key not in experiment.others}
+    draw(PICTURES / f"{name}.png", pairs, logs)
+    experiment.draw_more(runs)
+    return row(name, read_log(first(runs).folder), words)
 
 
 def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
@@ -239,12 +139,9 @@ def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
         return
     if "fig08" in names:
         paper_gradients.remake(output / "fig08")
-    if "fig07" not in names:
-        return
-    lacking = path_replay.why_not()
-    if lacking:
+    if "fig07" in names and (lacking := path_replay.why_not()):
         print(f"fig07 left out, it {lacking}; fig08 is without path replay")
-    else:
+    elif "fig07" in names:
         paper_path_replay.remake(output / "fig07", is_kept=is_kept)
 
 
@@ -257,35 +154,17 @@ def main() -> None:
         "names", nargs="*", metavar="NAME", help="of a config in configs/paper; all unless given"
     )
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper")
-    parser.add_argument("--size", choices=("small", "paper"), default="small")
-    parser.add_argument("--iterations", type=int, help="instead of as many as the paper's size has")
-    parser.add_argument(
-        "--paths",
-        type=int,
-        help="a pixel of the pictures at the paper's size; unless given, as many as those shipped",
-    )
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()
-    names, is_small, rows = (
-        given.names or [config.stem for config in CONFIGS.glob("*.yaml")],
-        given.size == "small",
-        dict[str, str](),
-    )
-    for experiment in EXPERIMENTS:
-        if experiment.name not in names:
-            continue
-        overrides = (
-            []
-            if is_small
-            else at_paper_size(experiment, given.output, given.iterations, given.paths)
-        )
-        rows[experiment.name] = remake(
-            experiment, given.output / given.size, overrides, is_small, given.keep
-        )
-        print(rows[experiment.name], end="", flush=True)
-    if is_small:
-        merge_rows(rows)
-        remake_replay(names, given.output, given.keep)
+    names = given.names or [config.stem for config in CONFIGS.glob("*.yaml")]
+    rows = {line.split(" | ")[0][2:]: line for line in read_store()["paper"]["table"][2:]}
+    for name in EXPERIMENTS:
+        if name in names:
+            rows[name] = remake(name, given.output / "small", given.keep)
+            print(rows[name], flush=True)
+    lines = [*TOP, *(rows[name] for name in EXPERIMENTS if name in rows)]
+    keep("paper", "python benchmarks/paper.py", lines)
+    remake_replay(names, given.output, given.keep)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
-"""The pictures of docs/experiments.md: truth, ours, the absolute difference, and what a run took.
-Arrays are [h, w] or [h, w, 3].
+"""What the experiments of docs/experiments.md share: commands, and their pictures.
+
+A picture has truth, ours, the absolute difference, and what a run took. Arrays are [h, w] or [h, w,
+3].
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +26,10 @@ import matplotlib.pyplot as plt
 
 Array = NDArray[np.float32]
 Log = Mapping[str, NDArray[np.float64]]
+ROOT = Path(__file__).parents[1]
+CONFIGS, SHAPES, PICTURES = (
+    ROOT / place for place in ("configs/paper", "data/shapes", "docs/pictures/paper")
+)
 COLORS = 192
 """Colors of a picture's file."""
 
@@ -41,6 +48,17 @@ class Pair:
     def white(self) -> float:
         """The value shown brightest."""
         return max(float(np.quantile(self.ours if self.truth is None else self.truth, 0.999)), 1e-6)
+
+
+def ddrecon(*arguments: str | Path) -> None:
+    """Runs a command, quietly."""
+    command = ["ddrecon", *arguments, "-q", "--overwrite"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def as_options(overrides: Sequence[str]) -> list[str]:
+    """`overrides` as a command takes them."""
+    return [part for override in overrides for part in ("-D", override)]
 
 
 def read_log(run: Path) -> Log:
@@ -139,25 +157,14 @@ def show(axis: Any, values: Array | None, white: float, colors: str = "viridis")
 
 def _draw_logs(axes: Sequence[Any], logs: Mapping[str, Log]) -> None:
     for index, (name, log) in enumerate(logs.items()):
-        color, label = f"C{index}", name if len(logs) > 1 else ""
-        axes[0].semilogy(log["iteration"], log["loss"], color=color, label=label)
-        axes[1].plot(
-            log["iteration"],
-            log["forward_iterations"],
-            color=color,
-            label=f"{label} forward".strip(),
-        )
-        axes[1].plot(
-            log["iteration"],
-            log["adjoint_iterations"],
-            color=color,
-            linestyle=":",
-            label=f"{label} adjoint".strip(),
-        )
-        axes[2].plot(log["iteration"], pace(log), color=color, label=label)
-    for axis, title in zip(
-        axes, ("loss", "iterations of the solves", "seconds an iteration"), strict=True
-    ):
+        color, label, at = f"C{index}", name if len(logs) > 1 else "", log["iteration"]
+        axes[0].semilogy(at, log["loss"], color=color, label=label)
+        for kind, style in (("forward", "-"), ("adjoint", ":")):
+            words = f"{label} {kind}".strip()
+            axes[1].plot(at, log[f"{kind}_iterations"], color=color, linestyle=style, label=words)
+        axes[2].plot(at, pace(log), color=color, label=label)
+    titles = ("loss", "iterations of the solves", "seconds an iteration")
+    for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=7)
         axis.set_xlabel("iteration", fontsize=7)

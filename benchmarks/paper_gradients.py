@@ -19,9 +19,20 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
+from figures import keep
 from numpy.typing import NDArray
-from paper_figures import Array, save, show, show_signed
-from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rewrite_table
+from paper_figures import (
+    CONFIGS,
+    PICTURES,
+    ROOT,
+    SHAPES,
+    Array,
+    as_options,
+    ddrecon,
+    save,
+    show,
+    show_signed,
+)
 from path_replay import ALBEDO, DENSITY, Replay, why_not
 
 from ddrecon.io.volumes.table import read_field, write_field
@@ -30,7 +41,6 @@ from ddrecon.scene_file.build import load_scene
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SCRIPT = Path(__file__).name
 CONFIG, CLOUD, PICTURE = CONFIGS / "fig08.yaml", SHAPES / "cloud.npz", PICTURES / "fig08.png"
 PATHS, REPLAY_PATHS = 8192, 512
 LARGER = 2
@@ -45,8 +55,8 @@ MODELS = {
     "2 rounds": ("diffusion.transport_rounds=2",),
 }
 """The paper's own scheme, and ours without and with transport rounds, as overrides."""
-TOP = "| by | what | noise | error | in the regions | correlation |\n|---|---|---|---|---|---|\n"
-TOP_PARTS = "| by | what | light scattered more than once | its derivative |\n|---|---|---|---|\n"
+TOP = "| by | what | noise | error | in the regions | correlation |", "|---|---|---|---|---|---|"
+TOP_PARTS = "| by | what | light scattered more than once | its derivative |", "|---|---|---|---|"
 
 
 @dataclass(frozen=True)
@@ -145,34 +155,22 @@ def _replay_once(change: Change, paths: int, seed: int) -> Array:
 
 
 def differentiate(change: Change, folder: Path, model: str) -> dict[str, Array]:
-    """By one of `MODELS`: the `image` [h, w] and its `derivative`, and of each the part of light
-    scattered more than once, as `many`.
+    """By one of `MODELS`: the `derivative` of the image [h, w]; what is seen of light scattered at
+    most once, `single`, and more often, `multiple`; and the `slope` of each.
     """
     output = folder / f"{change.parameter}_{model[0]}"
-    ddrecon(
-        "render",
-        CONFIG,
-        "-o",
-        output,
-        "--components",
-        "--gradient",
-        change.parameter,
-        *as_options([change.between, *MODELS[model]]),
-    )
-    names = {"single": "front.single", "multiple": "front.multiple"}
-    parts = {name: np.load(output / f"{file}.npy").mean(-1) for name, file in names.items()}
-    slopes = {
-        name: np.load(output / f"{file.replace('front', 'front.gradient')}.npy").mean(-1)
-        for name, file in names.items()
-    }
-    reduced = np.load(output / "front.gradient.reduced.npy").mean(-1)
-    return {
-        "derivative": slopes["single"] + slopes["multiple"] + reduced,
-        "single": parts["single"],
-        "single slope": slopes["single"] + reduced,
-        "multiple": parts["multiple"],
-        "multiple slope": slopes["multiple"],
-    }
+    options = ["--components", "--gradient", change.parameter]
+    options += as_options([change.between, *MODELS[model]])
+    ddrecon("render", CONFIG, "-o", output, *options)
+
+    def read(name: str) -> Array:
+        mean: Array = np.load(output / f"front.{name}.npy").mean(-1)
+        return mean
+
+    once = read("gradient.single") + read("gradient.reduced")
+    often = read("gradient.multiple")
+    parts = {"single": read("single"), "multiple": read("multiple"), "derivative": once + often}
+    return parts | {"single slope": once, "multiple slope": often}
 
 
 def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
@@ -203,40 +201,31 @@ def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -
     """Draws the picture and rewrites both tables."""
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    seen, lines, parts = regions(folder), [], []
+    seen, lines, parts = regions(folder), [*TOP], [*TOP_PARTS]
+    coarse = {name: coarsen(region.astype(np.float32)) > 0.5 for name, region in seen.items()}
     figure, axes = plt.subplots(2, 9, figsize=(15, 4), layout="constrained")
     for row, change in zip(axes, changes(folder), strict=True):
         truth, noise = trace_derivative(change, folder, paths)
         full = float(np.quantile(np.abs(truth), 0.99))
         row[0].set_ylabel(f"by {change.parameter}")
         show_signed(row[0], truth, full, "differences of\npath tracing")
-        images = {name: differentiate(change, folder, name) for name in MODELS}
-        for (name, found), axis, error_axis in zip(images.items(), row[2:5], row[6:], strict=True):
-            lines.append(line(change, name, found["derivative"], truth, noise, seen))
-            _draw_comparison(axis, error_axis, found["derivative"], truth, full, f"ours, {name}")
-        parts += shares(change, images, folder, truth, seen["thick"])
-        for axis in (row[1], row[5]):
+        for axis in row[1:]:
             axis.axis("off")
+        images = {name: differentiate(change, folder, name) for name in MODELS}
+        for column, (name, image) in enumerate(images.items(), 2):
+            lines.append(line(change, name, image["derivative"], truth, noise, seen))
+            both = row[column], row[column + 4]
+            _draw_comparison(both, image["derivative"], truth, full, f"ours, {name}")
+        parts += shares(change, images, folder, truth, seen["thick"])
         if why_not() is None:
-            image, scatter = replay_derivative(change, folder, replay_paths)
-            regions_there = {
-                name: coarsen(region.astype(np.float32)) > 0.5 for name, region in seen.items()
-            }
-            lines.append(
-                line(
-                    change,
-                    "path replay, larger pixels",
-                    image,
-                    coarsen(truth),
-                    scatter,
-                    regions_there,
-                )
-            )
-            _draw_comparison(row[1], row[5], image, coarsen(truth), full, "path replay")
+            image, noise = replay_derivative(change, folder, replay_paths)
+            name, truth = "path replay, larger pixels", coarsen(truth)
+            lines.append(line(change, name, image, truth, noise, coarse))
+            _draw_comparison((row[1], row[5]), image, truth, full, "path replay")
     save(figure, PICTURE)
-    for name, top, text in ((SCRIPT, TOP, lines), (f"{SCRIPT} (parts)", TOP_PARTS, parts)):
-        print(top + "".join(text), end="")
-        rewrite_table(name, top + "".join(text))
+    command = "python benchmarks/paper_gradients.py"
+    keep("fig08", command, lines)
+    keep("fig08_parts", f"{command} (parts)", parts)
 
 
 def line(
@@ -248,16 +237,12 @@ def line(
     seen: dict[str, NDArray[np.bool_]],
 ) -> str:
     """A line of the table: errors of `image`, and the `noise` there is in truth, or in it."""
-    told = ", ".join(
-        f"{region} {relative_error(image[where], truth[where]):.3f}"
-        for region, where in seen.items()
-    )
-    size, alike = np.sqrt((truth**2).mean()), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
-    return (
-        f"| {change.parameter} | {name} | {noise / size:.3f} | {relative_error(image, truth):.3f} "
-        "| "
-        f"{told} | {alike:.3f} |\n"
-    )
+    errors = ((region, relative_error(image[at], truth[at])) for region, at in seen.items())
+    words = ", ".join(f"{region} {error:.3f}" for region, error in errors)
+    alike = np.corrcoef(image.ravel(), truth.ravel())[0, 1]
+    numbers = noise / np.sqrt((truth**2).mean()), relative_error(image, truth)
+    cells = [change.parameter, name, *(f"{n:.3f}" for n in numbers), words, f"{alike:.3f}"]
+    return f"| {' | '.join(cells)} |"
 
 
 def shares(
@@ -282,8 +267,19 @@ def shares(
             for kind in ("multiple", "single", "multiple slope", "single slope")
         )
         parts = multiple / (light - single), multiple_slope / (slope - single_slope)
-        rows.append(f"| {change.parameter} | {name} | {parts[0]:.3f} | {parts[1]:.3f} |\n")
+        rows.append(f"| {change.parameter} | {name} | {parts[0]:.3f} | {parts[1]:.3f} |")
     return rows
+
+
+def _draw_comparison(
+    axes: tuple[Any, Any], image: Array, truth: Array, full: float, title: str
+) -> None:
+    for axis in axes:
+        axis.axis("on")
+    show_signed(axes[0], image, full, title)
+    show(axes[1], np.abs(image - truth), full / ENLARGED, "inferno")
+    words = f"{ENLARGED} x |error|,\n{title}: {relative_error(image, truth):.2f}"
+    axes[1].set_title(words, fontsize=8)
 
 
 def main() -> None:
@@ -296,18 +292,6 @@ def main() -> None:
     parser.add_argument("--replay-paths", type=int, default=REPLAY_PATHS)
     given = parser.parse_args()
     remake(given.output, given.paths, given.replay_paths)
-
-
-def _draw_comparison(
-    axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str
-) -> None:
-    for each in (axis, error_axis):
-        each.axis("on")
-    show_signed(axis, image, full, title)
-    show(error_axis, np.abs(image - truth), full / ENLARGED, "inferno")
-    error_axis.set_title(
-        f"{ENLARGED} x |error|,\n{title}: {relative_error(image, truth):.2f}", fontsize=8
-    )
 
 
 if __name__ == "__main__":

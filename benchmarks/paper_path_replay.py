@@ -16,16 +16,16 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import torch
-from paper_figures import Array, project, save, show
-from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
+from figures import keep
+from paper_figures import CONFIGS, PICTURES, ROOT, SHAPES, Array, project, save, show
 from path_replay import DENSITY, HEADROOM, Replay, why_not
+from torch.nn.functional import interpolate
 
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.frame import Frame
@@ -37,34 +37,49 @@ from ddrecon.scene_file.build import load_scene
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SCRIPT = Path(__file__).name
-CONFIG, TARGET = CONFIGS / "fig07.yaml", ROOT / "data" / "paper" / "fig07"
+CONFIG, TARGET = CONFIGS / "fig07.yaml", ROOT / "data/paper/fig07/front.npy"
 PATHS, RATE, RAYS = 64, 0.1, 4
 """Paths and rays a pixel of theirs and of ours; learning rate at first."""
 FINAL_RATE = 0.2
 """The part to which it falls."""
-ENLARGED = 256
+LARGE = 256
 """Pixels a side of the picture that is only timed: the smallest of the paper's."""
 JUDGED_AT = (5, 15, 40)
 JUDGING, CONVERGED = 64, 512
 """Paths a pixel of each trace that judges, and of each target."""
-TOP = (
-    "| pixels | total variation | | seconds an iteration | times ours | error, shown view | "
-    "novel view | L1 error of density | along z |\n"
-    "|---|---|---|---|---|---|---|---|---|\n"
+CONTENDERS = {
+    "ours": (None, ()),
+    "ours, one round": (None, ("diffusion.transport_rounds=1",)),
+    "path replay": (1.0, ()),
+    "path replay, higher majorant": (HEADROOM, ()),
+}
+"""How many times the densest path replay's majorant is, None of us; and overrides."""
+CASES = (
+    (3, 0.0, ("ours", "path replay", "path replay, higher majorant")),
+    (2, None, ("ours", "ours, one round", "path replay")),
 )
+"""How much larger pixels are, the weight of the total variation (None: its default), and who
+competes.
+"""
+HEAD = "pixels", "total variation", "", "seconds an iteration", "times ours"
+HEAD += "error, shown view", "novel view", "L1 error of density", "along z"
 
 
 @dataclass(frozen=True)
-class Found:
-    """Seconds and loss of each iteration, and the density [z, y, x] after some."""
+class Run:
+    """Seconds and loss of each iteration; densities [z, y, x] and squared errors after some.
 
-    seconds: list[float]
-    losses: list[float]
+    In the end there is the error of the novel view, too. It is of pixels `times` as large, and of
+    the total variation `tv`.
+    """
+
+    times: int
+    tv: float | None
+    name: str
+    seconds: Array
+    losses: Array
     densities: dict[int, Array]
-
-
-Contender = Callable[[Scene, int], Found]
+    errors: dict[int, Array]
 
 
 class Steps:
@@ -89,88 +104,52 @@ class Steps:
             value.copy_(self.parameter.project(value))
 
 
-def by_us(scene: Scene, iterations: int) -> Found:
-    """Our derivatives."""
-    frame, found = Frame(scene, iterations), Found([], [], {})
-    frame.enter(len(frame.problem.factors) - 1)
-    (parameter,) = frame.parameters
-    steps = Steps(parameter, iterations)
-    for _ in range(iterations):
-        start = time.process_time()
-        objective = frame.evaluate().objective
-        steps.step(objective.slopes(1.0)["density"])
-        seconds = time.process_time() - start
-        _note(found, seconds, objective.total(1.0), parameter.value.detach())
-    return found
-
-
-def by_path_replay(scene: Scene, iterations: int, headroom: float = 1.0) -> Found:
-    """The same by path replay, with Mitsuba's majorant raised to `headroom` times the densest; its
-    losses are those of noisy pictures.
+def reconstruct(
+    scene: Scene, iterations: int, headroom: float | None
+) -> tuple[list[float], list[float], dict[int, Array]]:
+    """Seconds and losses of iterations, and the density after some; losses of path replay are
+    those of noisy pictures.
     """
-    import drjit
+    if headroom is None:
+        frame = Frame(scene, iterations)
+        frame.enter(len(frame.problem.factors) - 1)
+        (parameter,) = frame.parameters
+    else:
+        import drjit
 
-    settings = scene.optimize.parameters["density"]
-    parameter = Parameter("density", settings, scene.starts["density"], scene.volume.grid)
-    steps = Steps(parameter, iterations)
-    target = scene.views[0].image.movedim(0, -1)
-    replay, found, power = (
-        Replay.of(scene, headroom),
-        Found([], [], {}),
-        float(target.square().mean()),
-    )
-    wanted = replay.module.TensorXf(target.numpy())
+        settings = scene.optimize.parameters["density"]
+        parameter = Parameter("density", settings, scene.starts["density"], scene.volume.grid)
+        target, replay = scene.views[0].image.movedim(0, -1), Replay.of(scene, headroom)
+        power, wanted = float(target.square().mean()), replay.module.TensorXf(target.numpy())
+    steps, seconds, losses, densities = Steps(parameter, iterations), [], [], {}
     for iteration in range(iterations):
         start, density = time.process_time(), parameter.value.detach()
-        replay.set_density(density)
-        loss, (gradient,) = replay.gradients(
-            lambda image: drjit.mean(drjit.square(image - wanted), axis=None),
-            [replay.name(DENSITY)],
-            iteration,
-            PATHS,
-        )
-        penalty, smooth = parameter.penalty() or (0.0, 0.0)
-        steps.step(replay.by_density(gradient, density) / power + smooth)
-        total = loss / power + float(penalty)
-        _note(found, time.process_time() - start, total, parameter.value.detach())
-    return found
-
-
-def _note(found: Found, seconds: float, loss: float, density: torch.Tensor) -> None:
-    found.seconds.append(seconds)
-    found.losses.append(loss)
-    if len(found.losses) in JUDGED_AT:
-        found.densities[len(found.losses)] = density.numpy().copy()
-    if len(found.losses) % 10 == 0:
-        print(f"  {len(found.losses)}: {sum(found.seconds):.1f} s, loss {loss:.3g}", flush=True)
-
-
-CONTENDERS: dict[str, tuple[Contender, tuple[str, ...]]] = {
-    "ours": (by_us, ()),
-    "ours, one round": (by_us, ("diffusion.transport_rounds=1",)),
-    "path replay": (by_path_replay, ()),
-    "path replay, higher majorant": (
-        lambda scene, iterations: by_path_replay(scene, iterations, HEADROOM),
-        (),
-    ),
-}
-CASES = (
-    (3, 0.0, ("ours", "path replay", "path replay, higher majorant")),
-    (2, None, ("ours", "ours, one round", "path replay")),
-)
-"""How much larger pixels are, the weight of the total variation (None: its default), and who
-competes.
-"""
+        if headroom is None:
+            objective = frame.evaluate().objective
+            steps.step(objective.slopes(1.0)["density"])
+            losses.append(objective.total(1.0))
+        else:
+            replay.set_density(density)
+            loss, (gradient,) = replay.gradients(
+                lambda image: drjit.mean(drjit.square(image - wanted), axis=None),
+                [replay.name(DENSITY)],
+                iteration,
+                PATHS,
+            )
+            penalty, smooth = parameter.penalty() or (0.0, 0.0)
+            steps.step(replay.by_density(gradient, density) / power + smooth)
+            losses.append(loss / power + float(penalty))
+        seconds.append(time.process_time() - start)
+        if iteration + 1 in JUDGED_AT:
+            densities[iteration + 1] = parameter.value.detach().numpy().copy()
+    return seconds, losses, densities
 
 
 def enlarge(picture: Array, times: int) -> Array:
     """`picture` [h, w, 3] in pixels `times` times as large."""
     height, width = (size // times for size in picture.shape[:2])
-    mean: Array = (
-        picture[: height * times, : width * times]
-        .reshape(height, times, width, times, 3)
-        .mean((1, 3))
-    )
+    parts = picture[: height * times, : width * times].reshape(height, times, width, times, 3)
+    mean: Array = parts.mean((1, 3))
     return mean
 
 
@@ -178,50 +157,13 @@ def scene_of(picture: Array, folder: Path, overrides: tuple[str, ...], tv: float
     """The scene to reconstruct from `picture` [h, w, 3] alone."""
     path = folder / f"front_{len(picture)}.npy"
     np.save(path, picture)
-    settings = {
-        "render.samples_per_pixel": RAYS,
-        "views.0.image": path.resolve(),
-    }
-    weights = {} if tv is None else {"optimize.parameters.density.tv": tv}
-    scene = load_scene(
-        CONFIG,
-        overrides=[*(f"{key}={value}" for key, value in (settings | weights).items()), *overrides],
-    )
+    keys = [f"render.samples_per_pixel={RAYS}", f"views.0.image={path.resolve()}"]
+    keys += [] if tv is None else [f"optimize.parameters.density.tv={tv}"]
+    scene = load_scene(CONFIG, overrides=[*keys, *overrides])
     return replace(scene, views=scene.views[:1])
 
 
-@dataclass(frozen=True)
-class Judge:
-    """Path tracing: two `targets` [h, w, 3] of each view of `scene`, each with noise of its own."""
-
-    scene: Scene
-    targets: list[list[Array]]
-
-    @staticmethod
-    def of(folder: Path) -> Judge:
-        """That of the true volume, traced unless `folder` has it."""
-        scene = load_scene(CONFIG, overrides=[f"volume.density={{file: {SHAPES / 'cloud.npz'}}}"])
-        path = folder / "targets.npy"
-        if not path.exists():
-            np.save(
-                path,
-                _trace(scene, scene.volume.density.numpy(), CONVERGED, 1000, len(scene.views)),
-            )
-        return Judge(scene, np.load(path))
-
-    def errors(self, density: Array, times: int, views: int) -> list[float]:
-        """The mean squared error of each of the first `views`, in pixels `times` times as large,
-        without noise.
-        """
-        pictures = _trace(self.scene, density, JUDGING, 0, views)
-        pairs = [
-            [enlarge(a - b, times) for a, b in zip(*both, strict=True)]
-            for both in zip(pictures, self.targets, strict=False)
-        ]
-        return [float((first * second).mean()) for first, second in pairs]
-
-
-def _trace(scene: Scene, density: Array, paths: int, seed: int, views: int) -> list[list[Array]]:
+def trace(scene: Scene, density: Array, paths: int, seed: int, views: int) -> list[list[Array]]:
     """Two pictures of each of the first `views`, each `seed` and those after it with paths of its
     own.
     """
@@ -233,165 +175,119 @@ def _trace(scene: Scene, density: Array, paths: int, seed: int, views: int) -> l
     ]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One run: the case it is of, what it found, and its squared errors where judged, in the end of
-    the novel view too.
-    """
+def judge(truth: Scene, folder: Path, density: Array, times: int, views: int) -> list[float]:
+    """The squared error of each of the first `views`, in pixels `times` as large, without noise.
 
-    case: tuple[int, float | None]
-    name: str
-    found: Found
-    errors: dict[int, list[float]]
+    Targets, two of each view of `truth` with noise of their own, are traced unless `folder` has
+    them.
+    """
+    path = folder / "targets.npy"
+    if not path.exists():
+        true = truth.volume.density.numpy()
+        np.save(path, trace(truth, true, CONVERGED, 1000, len(truth.views)))
+    squares = []
+    for pair in zip(trace(truth, density, JUDGING, 0, views), np.load(path), strict=False):
+        first, second = (enlarge(a - b, times) for a, b in zip(*pair, strict=True))
+        squares.append(float((first * second).mean()))
+    return squares
 
 
 def run(
-    case: tuple[int, float | None],
-    name: str,
-    folder: Path,
-    iterations: int,
-    judge: Judge,
-    is_kept: bool,
-) -> Entry:
+    times: int, tv: float | None, name: str, folder: Path, iterations: int, is_kept: bool
+) -> Run:
     """Runs a contender, or reads what it did."""
-    times, tv = case
     words = (times, "default" if tv is None else tv, *name.replace(",", "").split())
     path = folder / f"{'_'.join(map(str, words))}.npz"
     if not (is_kept and path.exists()):
-        contender, overrides = CONTENDERS[name]
-        picture = enlarge(np.load(TARGET / "front.npy").astype(np.float32), times)
+        headroom, overrides = CONTENDERS[name]
+        picture = enlarge(np.load(TARGET).astype(np.float32), times)
         print(f"{len(picture)} pixels, total variation {tv}, {name}", flush=True)
-        found = contender(scene_of(picture, folder, overrides, tv), iterations)
-        errors = {
-            i: judge.errors(density, times, 2 if i == iterations else 1)
-            for i, density in found.densities.items()
-        }
-        densities = {
-            f"density_{iteration}": density for iteration, density in found.densities.items()
-        }
-        judged = {f"errors_{iteration}": values for iteration, values in errors.items()}
-        np.savez_compressed(path, seconds=found.seconds, losses=found.losses, **densities, **judged)
-    kept = np.load(path)
-    at = [int(key.removeprefix("density_")) for key in kept if key.startswith("density_")]
-    found = Found(
-        list(kept["seconds"]),
-        list(kept["losses"]),
-        {iteration: kept[f"density_{iteration}"] for iteration in at},
-    )
-    return Entry(
-        case, name, found, {iteration: list(kept[f"errors_{iteration}"]) for iteration in at}
-    )
+        scene = scene_of(picture, folder, overrides, tv)
+        seconds, losses, densities = reconstruct(scene, iterations, headroom)
+        true = f"volume.density={{file: {SHAPES / 'cloud.npz'}}}"
+        truth, arrays = load_scene(CONFIG, overrides=[true]), dict[str, object]()
+        for at, density in densities.items():
+            views = 2 if at == iterations else 1
+            arrays[f"errors_{at}"] = judge(truth, folder, density, times, views)
+            arrays[f"density_{at}"] = density
+        np.savez_compressed(path, seconds=seconds, losses=losses, **arrays)
+    stored = np.load(path)
+    at = [int(key.removeprefix("density_")) for key in stored if key.startswith("density_")]
+    densities, errors = ({i: stored[f"{key}_{i}"] for i in at} for key in ("density", "errors"))
+    return Run(times, tv, name, stored["seconds"], stored["losses"], densities, errors)
 
 
 def paces(folder: Path, is_kept: bool) -> dict[str, float]:
-    """Seconds of an iteration at `ENLARGED` pixels a side, the picture being enlarged and good for
+    """Seconds of an iteration at `LARGE` pixels a side, the picture being enlarged and good for
     nothing else.
     """
     path = folder / "paces.json"
-    if is_kept and path.exists():
-        return dict(json.loads(path.read_text()))
-    picture = torch.from_numpy(np.load(TARGET / "front.npy").astype(np.float32)).movedim(-1, 0)
-    enlarged = (
-        torch.nn.functional.interpolate(picture[None], (ENLARGED, ENLARGED), mode="bilinear")[0]
-        .movedim(0, -1)
-        .numpy()
-    )
-    scene = scene_of(enlarged, folder, (), None)
-    found = {
-        "ours": float(np.median(by_us(scene, 10).seconds)),
-        "path replay": by_path_replay(scene, 1).seconds[-1],
-    }
-    path.write_text(json.dumps(found))
-    return found
+    if not (is_kept and path.exists()):
+        picture = torch.from_numpy(np.load(TARGET).astype(np.float32)).movedim(-1, 0)
+        enlarged = interpolate(picture[None], (LARGE, LARGE), mode="bilinear")[0].movedim(0, -1)
+        scene = scene_of(enlarged.numpy(), folder, (), None)
+        ours, theirs = (reconstruct(scene, *how)[0] for how in ((10, None), (1, 1.0)))
+        seconds = {"ours": float(np.median(ours)), "path replay": theirs[-1]}
+        path.write_text(json.dumps(seconds))
+    return dict(json.loads(path.read_text()))
 
 
-def flat_error(density: Array, truth: Array) -> float:
-    """The relative L1 error of the density's sum along z."""
-    return float(
-        np.abs(project(density, 0, 1) - project(truth, 0, 1)).sum() / project(truth, 0, 1).sum()
-    )
-
-
-def table(entries: list[Entry], enlarged: dict[str, float], truth: Array) -> str:
+def table(runs: list[Run], enlarged: dict[str, float], truth: Array) -> list[str]:
     """The table of the page."""
-    base = {
-        entry.case: float(np.median(entry.found.seconds))
-        for entry in entries
-        if entry.name == "ours"
-    }
-    lines = []
-    for entry in entries:
-        (times, tv), last, pace = (
-            entry.case,
-            max(entry.errors),
-            float(np.median(entry.found.seconds)),
-        )
-        shown, novel = entry.errors[last]
-        density = entry.found.densities[last]
-        found = (
-            f"{np.abs(density - truth).sum() / truth.sum():.2f} | {flat_error(density, truth):.2f}"
-        )
-        words = "none" if tv == 0 else "default"
-        figures = (
-            f"{pace:.2g} | {pace / base[entry.case]:.1f} | {shown:.1e} | {novel:.1e} | {found}"
-        )
-        lines.append(f"| {96 // times}^2 | {words} | {entry.name} | {figures} |\n")
-    lines += [
-        f"| {ENLARGED}^2 | default | {name} | {pace:.2g} | {pace / enlarged['ours']:.1f} | | | | "
-        "|\n"
-        for name, pace in enlarged.items()
-    ]
-    return TOP + "".join(lines)
+    rows = [HEAD, ("---",) * len(HEAD)]
+    base = {entry.times: np.median(entry.seconds) for entry in runs if entry.name == "ours"}
+    for entry in runs:
+        last, pace = max(entry.errors), np.median(entry.seconds)
+        density, (shown, novel) = entry.densities[last], entry.errors[last]
+        flat, true = project(density, 0, 1), project(truth, 0, 1)
+        row = [f"{96 // entry.times}^2", "none" if entry.tv == 0 else "default", entry.name]
+        row += [f"{pace:.2g}", f"{pace / base[entry.times]:.1f}", f"{shown:.1e}", f"{novel:.1e}"]
+        row += [f"{np.abs(density - truth).sum() / truth.sum():.2f}"]
+        rows.append((*row, f"{np.abs(flat - true).sum() / true.sum():.2f}"))
+    for name, pace in enlarged.items():
+        timed = f"{pace:.2g}", f"{pace / enlarged['ours']:.1f}"
+        rows.append((f"{LARGE}^2", "default", name, *timed, "", "", "", ""))
+    return [f"| {' | '.join(row)} |" for row in rows]
 
 
-def draw(entries: list[Entry], truth: Array, path: Path) -> None:
+def draw(runs: list[Run], truth: Array, path: Path) -> None:
     """Writes the picture: for each case errors against iterations and seconds, and the density
     along z.
     """
-    cases = list(dict.fromkeys(entry.case for entry in entries))
+    size, widths = (12.5, 2.6 * len(CASES)), (1.5, 1.5, 1, 1, 1, 1)
     figure, axes = plt.subplots(
-        len(cases),
-        6,
-        figsize=(12.5, 2.6 * len(cases)),
-        layout="constrained",
-        width_ratios=(1.5, 1.5, 1, 1, 1, 1),
+        len(CASES), 6, figsize=size, layout="constrained", width_ratios=widths
     )
-    full = float(project(truth, 0, 1).max())
-    for row, case in zip(axes, cases, strict=True):
+    flat = project(truth, 0, 1)
+    for row, (times, tv, _) in zip(axes, CASES, strict=True):
         for axis in row[2:]:
             axis.axis("off")
-        some = [entry for entry in entries if entry.case == case]
-        for index, entry in enumerate(some):
-            _curves(row[:2], entry, f"C{list(CONTENDERS).index(entry.name)}")
-            show(row[3 + index], project(entry.found.densities[max(entry.errors)], 0, 1), full)
-        for axis, title in zip(
-            row[2:], ["truth", *(entry.name.replace(", ", ",\n") for entry in some)], strict=False
-        ):
+        entries = [entry for entry in runs if entry.times == times]
+        maps = {"truth": flat}
+        for entry in entries:
+            _draw_curves(row[:2], entry, f"C{list(CONTENDERS).index(entry.name)}")
+            density = entry.densities[max(entry.errors)]
+            maps[entry.name.replace(", ", ",\n")] = project(density, 0, 1)
+        for axis, (title, values) in zip(row[2:], maps.items(), strict=False):
             axis.axis("on")
             axis.set_title(title, fontsize=8)
-        show(row[2], project(truth, 0, 1), full)
-        row[0].set_ylabel(
-            f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total "
-            "variation",
-            fontsize=8,
-        )
+            show(axis, values, float(flat.max()))
+        smoothing = f"{'no' if tv == 0 else 'with'} total variation"
+        row[0].set_ylabel(f"{96 // times} x {96 // times} pixels,\n{smoothing}", fontsize=8)
         row[0].legend(fontsize=5)
-    axes[0, 0].set_title(
-        "loss of its own (line), error\nby path tracing (dots); iteration", fontsize=8
-    )
+    title = "loss of its own (line), error\nby path tracing (dots); iteration"
+    axes[0, 0].set_title(title, fontsize=8)
     axes[0, 1].set_title("the same against seconds", fontsize=8)
     save(figure, path)
 
 
-def _curves(axes: list[plt.Axes], entry: Entry, color: str) -> None:
-    seconds = np.cumsum(entry.found.seconds)
-    at = sorted(entry.errors)
+def _draw_curves(axes: list[plt.Axes], entry: Run, color: str) -> None:
+    seconds, at = np.cumsum(entry.seconds), sorted(entry.errors)
     judged = [entry.errors[iteration][0] for iteration in at]
-    axes[0].semilogy(
-        range(1, len(seconds) + 1), entry.found.losses, color=color, label=entry.name, linewidth=1
-    )
+    line = {"color": color, "linewidth": 1}
+    axes[0].semilogy(range(1, len(seconds) + 1), entry.losses, label=entry.name, **line)
     axes[0].semilogy(at, judged, "o", color=color, markersize=4)
-    axes[1].loglog(seconds, entry.found.losses, color=color, linewidth=1)
+    axes[1].loglog(seconds, entry.losses, **line)
     axes[1].loglog(seconds[np.array(at) - 1], judged, "o", color=color, markersize=4)
     for axis in axes:
         axis.tick_params(labelsize=6)
@@ -401,16 +297,15 @@ def remake(folder: Path, iterations: int = 40, is_kept: bool = False) -> None:
     """Draws the picture and rewrites the table."""
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    truth, judge = read_field(SHAPES / "cloud.npz", "density").values, Judge.of(folder)
-    entries = [
-        run((times, tv), name, folder, iterations, judge, is_kept)
+    truth = read_field(SHAPES / "cloud.npz", "density").values
+    runs = [
+        run(times, tv, name, folder, iterations, is_kept)
         for times, tv, names in CASES
         for name in names
     ]
-    draw(entries, truth, PICTURES / "fig07.png")
-    text = table(entries, paces(folder, is_kept), truth)
-    print(text, end="")
-    rewrite_table(SCRIPT, text)
+    draw(runs, truth, PICTURES / "fig07.png")
+    rows = table(runs, paces(folder, is_kept), truth)
+    keep("fig07", "python benchmarks/paper_path_replay.py", rows)
 
 
 def main() -> None:

@@ -5,15 +5,27 @@ the table.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import yaml
-from paper_figures import Array, Pair, draw, draw_derivatives, project, read_log
-from paper_page import CONFIGS, PICTURES, SHAPES, as_options, ddrecon, rewrite_table
+from figures import keep
+from paper_figures import (
+    CONFIGS,
+    PICTURES,
+    SHAPES,
+    Array,
+    Pair,
+    as_options,
+    ddrecon,
+    draw,
+    draw_derivatives,
+    project,
+    read_log,
+)
 
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
@@ -27,18 +39,17 @@ NAMES_13 = {
     "half_one_round": "half the cells, one round",
     "half_printed": "half the cells, printed",
 }
-TOP_13 = (
+TOP_13 = [
     "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the "
-    "lowest third | density there, in truth 1 |\n"
-    "|---|---|---|---|---|---|---|\n"
-)
+    "lowest third | density there, in truth 1 |",
+    "|---|---|---|---|---|---|---|",
+]
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run of the config `name` in `folder`."""
+    """A finished run in `folder`."""
 
-    name: str
     folder: Path
 
     def field(self, name: str) -> Array:
@@ -116,67 +127,38 @@ def show_density(truth: str, front: str) -> Shown:
 
 def draw_rounds(runs: Runs) -> None:
     """Fig. 13 by other models: a picture of the densities, and a table."""
-    lines, pairs = [], []
+    lines, pairs = [*TOP_13], []
     for name, run in runs.items():
         density, log = run.field("density"), read_log(run.folder)
-        true = shape("bunny", density)
-        pairs.append(
-            Pair(
-                f"{NAMES_13[name]}:\ndensity along x",
-                project(true, 2, 1),
-                project(density, 2, 1),
-            )
-        )
+        true, title = shape("bunny", density), f"{NAMES_13[name]}:\ndensity along x"
+        pairs.append(Pair(title, project(true, 2, 1), project(density, 2, 1)))
         low = slice(0, len(density[0]) // 3)
-        quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
-        parts = (
-            f"{relative_l1(density, true):.3f} | {relative_l1(density[:, low], true[:, low]):.2f} "
-            "| "
-            f"{density[:, low].sum() / true[:, low].sum():.2f}"
-        )
-        lines.append(
-            f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | "
-            f"{parts} |\n"
-        )
+        cells = [NAMES_13[name], len(log["loss"]), f"{log['seconds'][-1]:.0f}"]
+        cells += [f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"]
+        cells += [f"{relative_l1(density, true):.3f}"]
+        cells += [f"{relative_l1(density[:, low], true[:, low]):.2f}"]
+        cells += [f"{density[:, low].sum() / true[:, low].sum():.2f}"]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     draw(PICTURES / "fig13_rounds.png", pairs, {})
-    rewrite_table("paper.py fig13", TOP_13 + "".join(lines))
+    keep("fig13", "python benchmarks/paper.py fig13", lines)
 
 
 def draw_parts(runs: Runs) -> None:
     """Fig. 9: derivatives of pixels by density, of each part of the radiance, at the start and at
     what each run found.
     """
-    images, parts = (
-        [],
-        {
-            "single": ("reduced", "single"),
-            "diffusion": ("multiple",),
-            "all": ("reduced", "single", "multiple"),
-        },
-    )
+    images, single = [], ("reduced", "single")
+    parts = {"single": single, "diffusion": ("multiple",), "all": (*single, "multiple")}
+    bunny = as_options([f"volume.density={{file: {SHAPES}/bunny.npz}}"])
+    options = ["--view", "front", "--components", "--gradient", "density"]
     for name in parts:
-        run, bunny = runs[name], [f"volume.density={{file: {SHAPES}/bunny.npz}}"]
-        places = {"start": (CONFIGS / "fig09.yaml", bunny), "end": (run.folder, [])}
-        for place, (scene, overrides) in places.items():
-            folder = run.folder / f"derivative_{place}"
-            ddrecon(
-                "render",
-                scene,
-                "-o",
-                folder,
-                "--view",
-                "front",
-                "--components",
-                "--gradient",
-                "density",
-                *as_options(overrides),
-            )
-            image = sum(
-                np.load(folder / f"front.gradient.{part}.npy").mean(-1) for part in parts[name]
-            )
-            images.append(
-                (f"{name}, {'at the bunny' if place == 'start' else 'in the end'}", image)
-            )
+        run = runs[name].folder
+        starts = {"at the bunny": (CONFIGS / "fig09.yaml", bunny), "in the end": (run, [])}
+        for words, (scene, overrides) in starts.items():
+            folder = run / f"derivative_{words[:2]}"
+            ddrecon("render", scene, "-o", folder, *options, *overrides)
+            files = (folder / f"front.gradient.{part}.npy" for part in parts[name])
+            images.append((f"{name}, {words}", sum(np.load(file).mean(-1) for file in files)))
     draw_derivatives(PICTURES / "fig09_derivatives.png", images)
 
 
@@ -205,68 +187,41 @@ def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
 def show_optics(runs: Runs) -> tuple[list[Pair], str]:
     """Absorption and scattering coefficients in the middle of the cloud, and g."""
     run = first(runs)
-    fields = [run.field(name) for name in ("sigma_a", "sigma_s")]
-    density = shape("cloud", fields[0])[..., None]
-    truths = [
-        density * shape("cloud", field, name)
-        for name, field in zip(("sigma_a", "sigma_s"), fields, strict=True)
-    ]
-    found = [density * field for field in fields]
-    pairs = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
-    for title, color, truth, ours in zip(
-        ("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True
-    ):
-        pairs.append(
-            Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours)))
-        )
-    errors = ", ".join(
-        f"{relative_l1(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
-    )
+    fields = {name: run.field(name) for name in ("sigma_a", "sigma_s")}
+    density = shape("cloud", fields["sigma_a"])[..., None]
+    truths = [density * shape("cloud", field, name) for name, field in fields.items()]
+    ours = [density * field for field in fields.values()]
+    pairs, errors = compare_optics(truths, ours, middle, "middle slices")
     alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
-    return (
-        pairs,
-        f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and "
-        f"scattering {errors}",
-    )
+    words = f"g {run.number('g'):.3f}{alone}, in truth -0.802; {errors}"
+    views = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
+    return [*views, *pairs], words
 
 
 def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
-    """The colored smoke, and its coefficients in the middle."""
-    run = first(runs)
-    truths, found = (
-        [density * sigma for sigma in sigmas]
-        for density, *sigmas in (smoke_truth(run.field("density")), smoke_found(run))
-    )
-    pairs = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
-    for title, color, truth, ours in zip(
-        ("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True
-    ):
-        pairs.append(
-            Pair(
-                f"{title}, along z",
-                *(project(field[..., color], 0, 1) for field in (truth, ours)),
-            )
+    """The colored smoke, and its coefficients along z."""
+    run, names = first(runs), ("sigma_a", "sigma_s")
+    density = run.field("density")
+    true = shape("smoke", density)[..., None]
+    truths = [true * shape("smoke", density, name) for name in names]
+    ours = [density[..., None] * run.field(name) for name in names]
+    pairs, errors = compare_optics(truths, ours, lambda field: project(field, 0, 1), "along z")
+    views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
+    return [*views, *pairs], errors
+
+
+def compare_optics(
+    truths: Sequence[Array], ours: Sequence[Array], flatten: Callable[[Array], Array], words: str
+) -> tuple[list[Pair], str]:
+    """Absorption of red and scattering of green, flattened, and errors of both in all colors."""
+    pairs = [
+        Pair(
+            f"{title}, {words}", *(flatten(fields[index][..., index]) for fields in (truths, ours))
         )
-    errors = ", ".join(
-        f"{relative_l1(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
-    )
-    return pairs, f"relative L1 error of absorption and scattering {errors}"
-
-
-def smoke_truth(like: Array) -> list[Array]:
-    """Density [z, y, x, 1], sigma_a and sigma_s of the colored smoke, in cells as small as those of
-    `like`.
-    """
-    return [
-        shape("smoke", like)[..., None],
-        shape("smoke", like, "sigma_a"),
-        shape("smoke", like, "sigma_s"),
+        for index, title in enumerate(("absorption, red", "scattering, green"))
     ]
-
-
-def smoke_found(run: Run) -> list[Array]:
-    """The same as `run` found them."""
-    return [run.field("density")[..., None], run.field("sigma_a"), run.field("sigma_s")]
+    errors = ", ".join(f"{relative_l1(o, t):.2f}" for o, t in zip(ours, truths, strict=True))
+    return pairs, f"relative L1 error of absorption and scattering {errors}"
 
 
 def show_four(runs: Runs) -> tuple[list[Pair], str]:

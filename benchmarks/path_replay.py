@@ -28,12 +28,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench.measure import Shot, shoot
-from ddrecon.bench.plume import plume_scene
+from ddrecon.bench import Shot, shoot
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene, sensor_id
 from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
+from ddrecon.validate.hard import plume_scene
 
 RING = 2
 REPEATS, BLOCK = 5, 4

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import print_header, print_row
+from figures import print_header, print_row
 
 CLOUD = "synthetic_cloud_fields/jpl_les/rico32x37x26.txt"
 PICTURES = "vadim/experiments/LES_cloud_field_rico/monochromatic/measurements"

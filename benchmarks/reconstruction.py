@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import print_header, print_row
 
 from ddrecon.io.volumes.table import read_field
 
@@ -87,15 +88,9 @@ def density_errors(run: Path, truth: Path) -> tuple[float, float, float]:
     )
 
 
-def print_row(*cells: object) -> None:
-    shown = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
-    print(f"| {' | '.join(shown)} |", flush=True)
-
-
 def print_runs(runs: dict[str, tuple[str, str, Sequence[str]]], folder: Path) -> None:
     """Prints a row for each run: by its name the config, where its truth is, and options."""
-    print_row("run", "held out", "L1", "L2", "correlation", "seconds")
-    print_row(*["---"] * 6)
+    print_header("run", "held out", "L1", "L2", "correlation", "seconds")
     for name, (config, truth, options) in runs.items():
         place = folder / name.replace(" ", "_").replace(":", "")
         summary, seconds = optimize(config, place, options)
@@ -210,8 +205,7 @@ def print_film(folder: Path) -> None:
     options = [word for text in only for word in ("-D", text)]
     alone, seconds_alone, memory_alone = run_film(folder / "alone", *options)
     one, other = film["frames"][-1], alone["frames"][-1]
-    print_row("what", "five frames of the film", "the last of them alone")
-    print_row("---", "---", "---")
+    print_header("what", "five frames of the film", "the last of them alone")
     for what, key in (("held out", "test_psnr"), ("the same, registered", "registered_psnr")):
         print_row(f"{what}, last frame [dB]", f"{one[key]:.1f}", f"{other[key]:.1f}")
     in_film = [row["seconds"] for row in film["frames"][1:]]

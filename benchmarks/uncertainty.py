@@ -1,20 +1,17 @@
 """Is the uncertainty true? How often the truth lies within what `ddrecon uncertainty` says.
 
-    python benchmarks/uncertainty.py [NAME]... [--references FOLDER] [--cloud FILE]...
+    python benchmarks/uncertainty.py [NAME]... [--references FOLDER]
 
 Volumes that are known are reconstructed from path-traced pictures, and each cell's error is held
 against its deviation. What FOLDER/uncertainty does not hold of pictures is traced by Mitsuba 3
-(extra `reference`) and kept there; without it there are those that we ship. FILE is a cloud of a
-large-eddy simulation, as AT3D has them (`ext_per_km` [x, y, z], `dx`, `dy`, `z` in km).
+(extra `reference`) and kept there; without it there are those that we ship.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,17 +19,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from figures import print_header, print_row
 from torch import Tensor
 
 from ddrecon.engine import use_engine
-from ddrecon.io.volumes.table import read_field, write_field
-from ddrecon.numerics.around import mean_around
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.levels import resample, scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.deviations import EMPTY, Deviations
-from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty.experiments import EMPTY, Uncertainty, mean_around
 
 ROOT = Path(__file__).parents[1]
 Known = tuple[Scene, Tensor]
@@ -55,16 +51,12 @@ def read_density(path: Path) -> Tensor:
     return torch.from_numpy(read_field(path, "density").values.astype(np.float32))
 
 
-def known_cases(
-    references: Path | None, clouds: list[Path]
-) -> Iterator[tuple[str, Callable[[], Known]]]:
-    """The cases by name; those that are to be traced where there are `references`."""
-    for name, (config, truth) in SHIPPED.items():
-        yield name, partial(read_shipped, config, truth)
+def known_cases(references: Path | None) -> dict[str, Callable[[], Known]]:
+    """The cases by name; one that is to be traced where there are `references`."""
+    cases = {name: partial(read_shipped, *paths) for name, paths in SHIPPED.items()}
     if references is not None:
-        yield "ball", partial(trace_ball, references / "uncertainty" / "ball")
-        for path in clouds:
-            yield path.stem, partial(trace_cloud, path, references / "uncertainty" / path.stem)
+        cases["ball"] = partial(trace_ball, references / "uncertainty" / "ball")
+    return cases
 
 
 def read_shipped(config: Path, truth: Path) -> Known:
@@ -76,40 +68,6 @@ def trace_ball(folder: Path) -> Known:
     scene = load_scene(ROOT / "configs" / "ball.yaml")
     scene = replace(scene, views=[view for view in scene.views if not view.is_test])
     return with_traced(scene, ball / "truth.yaml", folder), read_density(ball / "density.npz")
-
-
-def trace_cloud(path: Path, folder: Path) -> Known:
-    """The cloud in `path`, its pictures in `folder`, beside what they are traced of."""
-    folder.mkdir(parents=True, exist_ok=True)
-    cloud = np.load(path)
-    density = cloud["ext_per_km"].transpose(2, 1, 0)[:, :40, :40]
-    step = [float(cloud["dx"]), float(cloud["dy"]), float(np.diff(cloud["z"]).mean())]
-    high = [side * cells for side, cells in zip(step, density.shape[::-1], strict=True)]
-    scale = float(np.quantile(density[density > 0], 0.99))
-    write_field(folder / "density.npz", "density", density / scale, np.array([[0, 0, 0], high]))
-    # Around the upright axis, which is z: all from above.
-    camera = {"type": "perspective", "target": [side / 2 for side in high], "up": [0, 0, 1]}
-    camera |= {"fov": 30, "resolution": [48, 48]}
-    ways = [(math.sin(turn), math.cos(turn), 0.5) for turn in np.arange(9) * 2 * math.pi / 9]
-    origins = [
-        [side / 2 + 2.4 * max(high) * w for side, w in zip(high, way, strict=True)] for way in ways
-    ]
-    views = [{"camera": camera | {"origin": origin}} for origin in origins]
-    volume = {"bounds": {"min": [0, 0, 0], "max": high}, "density": {"file": "density.npz"}}
-    scene = {
-        "volume": volume | {"sigma_t": min(scale, 60.0), "albedo": 1, "g": 0.85},
-        "lights": [
-            {"type": "directional", "direction": [0.35, 0.35, -0.87], "irradiance": 1},
-            {"type": "ambient", "radiance": 0.01},
-        ],
-        "render": {"background": False},
-        "views": views,
-    }
-    (folder / "truth.yaml").write_text(json.dumps(scene))
-    scene["optimize"] = {"iterations": 120, "parameters": {"density": {"init": 0, "min": 0}}}
-    (folder / "scene.yaml").write_text(json.dumps(scene))
-    known = with_traced(load_scene(folder / "scene.yaml"), folder / "truth.yaml", folder / "traced")
-    return known, torch.from_numpy(density / scale)
 
 
 def with_traced(scene: Scene, truth: Path, folder: Path) -> Scene:
@@ -131,12 +89,12 @@ def finish(scene: Scene) -> Reconstruction:
     return run
 
 
-def experiment(run: Reconstruction, experiments: int) -> Deviations:
-    """The deviations of `run` by so many experiments."""
+def experiment(run: Reconstruction, experiments: int) -> Uncertainty:
+    """So many `experiments` about `run`, made."""
     found = Uncertainty(run, seed=0)
     while found.count < experiments:
         found.step()
-    return Deviations(found)
+    return found
 
 
 def judge(known: Known, experiments: int) -> dict[str, Any]:
@@ -148,7 +106,7 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
     scene, truth = known
     run = finish(scene)
     deviations = experiment(run, experiments)
-    field, truth = deviations.fields["density"], resample(truth, run.level.train.volume.grid)
+    field, truth = deviations.fields()["density"], resample(truth, run.level.train.volume.grid)
     smoke, error = truth > EMPTY * truth.max(), (field.value - truth).abs()
     row: dict[str, Any] = {"cells": int(smoke.sum())}
     sizes = (error / field.deviation)[smoke]
@@ -175,34 +133,22 @@ def correlate_ranks(one: Tensor, other: Tensor) -> float:
     return float(torch.corrcoef(torch.stack(ranks))[0, 1])
 
 
-def print_rows(rows: Iterator[dict[str, Any]]) -> None:
-    """A table in Markdown, row by row."""
-    for at, row in enumerate(rows):
-        if at == 0:
-            print(f"| {' | '.join(row)} |\n{'|---' * len(row)}|")
-        print(f"| {' | '.join(map(str, row.values()))} |", flush=True)
-
-
 def main() -> None:
+    """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", help="only these volumes")
     parser.add_argument("--references", type=Path)
-    parser.add_argument("--cloud", dest="clouds", type=Path, action="append", default=[])
     parser.add_argument("--calibrate", type=int, default=2)
-    parser.add_argument("--engine", default="auto")
-    given = parser.parse_args()
-    use_engine(given.engine)
+    given, is_first = parser.parse_args(), True
+    use_engine("auto")
     torch.manual_seed(0)
-
-    def is_asked(name: str) -> bool:
-        return not given.names or name in given.names
-
-    cases = dict(known_cases(given.references, given.clouds))
-    print_rows(
-        {"volume": name} | judge(case(), given.calibrate)
-        for name, case in cases.items()
-        if is_asked(name)
-    )
+    for name, case in known_cases(given.references).items():
+        if not given.names or name in given.names:
+            row = {"volume": name} | judge(case(), given.calibrate)
+            if is_first:
+                print_header(*row)
+            print_row(*row.values())
+            is_first = False
 
 
 if __name__ == "__main__":

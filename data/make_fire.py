@@ -15,7 +15,7 @@ import torch
 from make_shapes import Array, centers, smooth_step, swirl, write
 from noisy import write_pictures
 
-from ddrecon.medium.black_body import black_body_radiance
+from ddrecon.medium.optics import black_body_radiance
 
 FOLDER = Path(__file__).parent / "fire"
 BOX = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])

@@ -16,9 +16,9 @@ _HOMES = {
     "fluence": "layer",
     "VolumeRenderer": "layer",
     "optimize": "reconstruct.loop",
-    "show": "report.notebook",
+    "show": "report.volumes",
     "optimize_sequence": "film.drive",
-    "Result": "reconstruct.log",
+    "Result": "reconstruct.frame",
     "Scene": "scene",
     "use_engine": "engine",
     "DdreconError": "errors",
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from ddrecon.layer import VolumeRenderer as VolumeRenderer
     from ddrecon.layer import fluence as fluence
     from ddrecon.layer import render as render
-    from ddrecon.reconstruct.log import Result as Result
+    from ddrecon.reconstruct.frame import Result as Result
     from ddrecon.reconstruct.loop import optimize as optimize
-    from ddrecon.report.notebook import show as show
+    from ddrecon.report.volumes import show as show
     from ddrecon.scene import Scene as Scene
     from ddrecon.scene_file.build import load_scene as load_scene
 else:  # where names are unknown to a type checker, they are wrong

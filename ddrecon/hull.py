@@ -33,10 +33,10 @@ MOST_PIXELS = 256
 BOX_CELLS, SHRINKS = 48, 0.97
 """Cells along each side of a box, which is cut to those that may hold smoke, again and again, until
 no side shrinks below this share of itself."""
-FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
+FILLED, HELD, CUT = 0.01, 0.05, 0.25
 """A box is far too large if less than FILLED of it may hold smoke; it is elsewhere or far too small
-if it holds less than HELD of the smoke, cuts off smoke that reaches beyond it by CUT of a side, and
-fits if it holds more than ALL."""
+if it holds less than HELD of the smoke, and cuts off smoke that reaches beyond it by CUT of a
+side."""
 
 OUTSIDE = "no overlap", "hardly any overlap"
 """Beginnings of `doubt_box` where a box is elsewhere."""
@@ -213,13 +213,13 @@ def bounds_text(box: Tensor) -> str:
     return f"bounds: {{min: [{low}], max: [{high}]}}"
 
 
-def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | None:
+def doubt_box(shown: Tensor, box: Tensor) -> str | None:
     """What is wrong with a scene's `box` where pictures show smoke in the box `shown`, [2, 3] each.
 
-    It says how they differ, which axes or unit of the cameras would explain it, and what to write.
-    `upright` are the axes (0, 1, 2: x, y, z) that point up by the cameras and by the scene.
+    It says how they differ, and what to write.
     """
-    held, filled = _share(shown, box)
+    sides = (torch.minimum(shown[1], box[1]) - torch.maximum(shown[0], box[0])).clamp(min=0)
+    held, filled = (float((sides / (ends[1] - ends[0])).prod()) for ends in (shown, box))
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
     if held < HELD:
@@ -232,40 +232,5 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
         fault = f"cut off, the pictures show smoke {beyond}"
     else:
         return None
-    # Where up does not tell of a turn, the longest side may.
-    old, new = upright
-    if old == new:
-        old, new = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
-    # A box that is cut off is of the right unit.
-    powers = () if held >= HELD and filled >= FILLED else (3, -3, 2, -2, 1, -1)
-    reason = _explain(shown, box, old, new, [1.0, *(10.0**power for power in powers)])
-    up = f" and up: {'xyz'[upright[0]]}" if upright[0] != upright[1] else ""
-    return f"{fault}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
-
-
-def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
-    """What shares of the boxes `shown` and `box` lie in both."""
-    sides = (torch.minimum(shown[1], box[1]) - torch.maximum(shown[0], box[0])).clamp(min=0)
-    held, filled = ((sides / (corners[1] - corners[0])).prod() for corners in (shown, box))
-    return float(held), float(filled)
-
-
-def _explain(shown: Tensor, box: Tensor, old: int, new: int, units: Sequence[float]) -> str:
-    """Which of `units`, and quarter turn of the axis `old` to `new`, have `shown` fill `box`."""
-    order, signs = [0, 1, 2], [1, 1, 1]
-    if old != new:
-        order[new], order[old], signs[old] = old, new, -1
-    turned = shown[:, order] * shown.new_tensor(signs)
-    for factor in units:
-        held, filled = _share((factor * turned).sort(0).values, box)
-        if held < ALL or filled < FILLED:
-            continue
-        words = list[str]()
-        if old != new:
-            axes = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
-            up = f"as if {'xyz'[old]} were up in the one and {'xyz'[new]} in the other"
-            words.append(f"({axes}) of the cameras as its (x, y, z), {up}")
-        if factor != 1:
-            words.append(f"lengths of the cameras times {factor:g}, as of another unit")
-        return f", but would fit with {', and '.join(words)}" if words else ""
-    return ""
+    advice = "or give the cameras the box's unit and axes"
+    return f"{fault}; take {bounds_text(shown)}, {advice}"

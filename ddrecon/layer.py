@@ -19,10 +19,9 @@ from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
 from ddrecon.supported import require_above
-from ddrecon.variables.forms import is_real
 from ddrecon.variables.kinds import PAIRS
 from ddrecon.variables.legal import require_legal, require_scene
-from ddrecon.variables.values import shapes_of, with_values
+from ddrecon.variables.values import is_real, shapes_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""

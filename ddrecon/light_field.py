@@ -43,7 +43,7 @@ from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_mediu
 from ddrecon.medium.levels import refine_medium, resample
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
-from ddrecon.numerics.periods import Unrolled, unroll
+from ddrecon.numerics.layout import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.bounced import reflected_light
@@ -229,7 +229,7 @@ def solve_diffuse(
     """
     if settings.is_conservative_p1:
         solve = SolverWithMemory(solve_by_multigrid, settings.tolerance, memory)
-        closure = Closure(settings.closure, medium.grid, settings.floor)
+        closure = Closure(settings.closure, medium.grid)
         problem = DiffusionProblem(medium, closure, source[0], outside, medium.degree > 0)
         light = solve_conservative(problem, solve)
         counts = settings.rounds, settings.angles, settings.transport_tolerance or 0.0
@@ -241,7 +241,7 @@ def solve_diffuse(
         solve = SolverWithMemory(iterate_picard, settings.tolerance, memory)
         return solve_flux_limited(medium, scattered, outside, solve, medium.has_flux)
     solve = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
-    diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
+    diffusion = smooth(medium.transport_extinction, medium.grid)
     return solve_printed(medium, diffusion, scattered, outside, solve, medium.has_flux)
 
 

@@ -24,11 +24,11 @@ from ddrecon.march.faces import scatter_back
 from ddrecon.march.ground import light_evenly, light_texels, reflect, upwards
 from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.levels import resample, volume_at_level
+from ddrecon.medium.optics import transmitted_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.periods import Unrolled
+from ddrecon.numerics.layout import Unrolled
 from ddrecon.scene import Scene
 from ddrecon.supported import require_supported
 

@@ -23,28 +23,43 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaini
 """The format of a bar that leaves room for a postfix in 80 columns."""
 
 
-def bar_settings(is_quiet: bool) -> dict[str, Any]:
-    """How every progress bar is shown: on stderr, and not at all if `is_quiet`.
+_is_quiet = True
+"""Nothing is shown unless a command says otherwise."""
+
+
+def be_quiet(is_quiet: bool) -> None:
+    """Has this process show no progress, or show it."""
+    global _is_quiet
+    _is_quiet = is_quiet
+
+
+def bar_settings() -> dict[str, Any]:
+    """How every progress bar is shown: on stderr, and not at all where it is quiet.
 
     A terminal that says it has no room, as some containers' do, gets 80 columns and 24 rows.
     """
     columns, rows = shutil.get_terminal_size()
-    settings = {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}
+    settings = {"file": sys.stderr, "disable": _is_quiet, "ncols": columns - 1, "nrows": rows}
     if not sys.stderr.isatty():
         settings |= {"mininterval": IN_A_LOG, "maxinterval": IN_A_LOG}
     return settings
 
 
-def say(text: str, is_quiet: bool) -> None:
-    """Writes `text` to stderr, above all bars, unless `is_quiet`."""
-    if not is_quiet:
+def show_progress(items: Sequence[Any], text: str) -> Iterable[Any]:
+    """The `items` one by one, beside a bar of this `text`."""
+    return tqdm(items, desc=text, leave=False, **bar_settings())
+
+
+def say(text: str) -> None:
+    """Writes `text` to stderr, above all bars, unless it is quiet."""
+    if not _is_quiet:
         tqdm.write(text, file=sys.stderr)
 
 
 @contextmanager
-def tell(text: str, is_quiet: bool) -> Iterator[None]:
-    """Writes `text` to stderr if the block takes long."""
-    timer = Timer(LONG, say, (f"{text} ...", is_quiet))
+def tell(text: str) -> Iterator[None]:
+    """Says `text` if the block takes long."""
+    timer = Timer(LONG, say, (f"{text} ...",))
     timer.daemon = True
     timer.start()
     try:

@@ -14,8 +14,6 @@ from typing import Literal
 
 from ddrecon.records import Violation, bounded, one_of
 
-FLOOR = 3.3
-"""Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 MOST_AROUND = 10000
 """Cameras of a ring, at most."""
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
@@ -54,7 +52,6 @@ class DiffusionSettings:
     model: `none` leaves such light out; `flux_limited` is the paper's for thin smoke.
     scheme: `printed` is the paper's own discretization, for comparison.
     closure: What the diffusion coefficient becomes in empty space.
-    floor: Of the smooth closure.
     tolerance: Relative residual of a solve.
     warm_start: Whether a solve begins at the last one's solution.
     transport_rounds: Sweeps along rays that take diffusion towards the transport equation. Left
@@ -74,7 +71,6 @@ class DiffusionSettings:
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"), expert=True)
     closure: str = one_of("geometric", ("geometric", "smooth"), expert=True)
-    floor: float = bounded(FLOOR, above=0, maximum=1e3, expert=True)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = bounded(True, expert=True)
     transport_rounds: int | None = bounded(None, minimum=0, maximum=16)

@@ -1,13 +1,14 @@
-"""What physics a scene needs, in words: by the conditions on which light is composed."""
+"""What `check` says of a scene: the physics it needs, and what can hardly be meant in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.ground import UPWARDS
+from ddrecon.light.ground import stay_above
 from ddrecon.light.lights import (
     BRIGHTNESS,
     AmbientLight,
@@ -16,33 +17,49 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
-from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.light_field import multiply_scatters
-from ddrecon.lighting import exchange_grid
-from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
-from ddrecon.medium.coefficients import Medium, scale_medium
-from ddrecon.medium.fresnel import transmitted_moments
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.optics import transmitted_moments
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.sweep import count_directions
+from ddrecon.variables.values import extinction_of, with_values
 
+LIGHTS = {
+    DirectionalLight: "directional light",
+    PointLight: "point light",
+    BeamLight: "beam from outside",
+}
 METHODS = {
     ("p1", "conservative"): "{} closure, multigrid",
     ("p1", "printed"): "smooth closure, printed scheme by Jacobi iteration",
     ("flux_limited", "conservative"): "damped Picard iteration with multigrid",
 }
 """How diffusion is solved, by model and scheme; the closure is named where one is chosen."""
+THICKEST, THINNEST = 3e3, 1e-3
+"""Optical depths beyond these look like a wall, or like nothing."""
+THICK_FACES, ABSORBING = 2.0, 2.5
+"""A cell at a face of extinction k, the forward peak left out, and absorption a is too thick where
+k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/hard_cases.md)."""
+FORWARD = 0.5
+"""From this mean cosine on g may be traded for fewer scatterings."""
+SMALLEST = 2.0
+"""A box of fewer pixels than this, along its diagonal, shows nothing."""
+UPRIGHT = 0.7
+"""A camera whose right is so much along the way up lies on its side."""
+UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
 
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    return list(_terms(scene))
+    return [*_find_terms(scene)]
 
 
-def _terms(scene: Scene) -> Iterator[str]:
+def _find_terms(scene: Scene) -> Iterator[str]:
     volume, medium = scene.volume, scale_medium(scene.volume, scene.diffusion.angles)
     is_diffuse = multiply_scatters(medium, scene.diffusion)
     yield _color_term(scene)
@@ -51,7 +68,7 @@ def _terms(scene: Scene) -> Iterator[str]:
     if volume.grid.periodic:
         axes = " and ".join("zyx"[axis] for axis in reversed(volume.grid.periodic))
         yield f"the volume repeats without end along {axes}"
-    yield from _light_terms(scene, is_diffuse)
+    yield from _light_terms(scene)
     if volume.emission is not None or volume.black_body is not None:
         emission = "emission" if volume.black_body is None else "emission of a black body"
         yield f"{emission}, {'scattered and seen' if is_diffuse else 'only seen: not scattered'}"
@@ -62,7 +79,6 @@ def _terms(scene: Scene) -> Iterator[str]:
             f"refractive index {volume.index:g}: faces reflect {inside:.1%} of diffuse light "
             f"inside, and {outside:.1%} of light from straight ahead"
         )
-    yield from _ground_terms(scene)
     if is_diffuse:
         yield from _diffuse_terms(medium, scene)
     else:
@@ -93,40 +109,20 @@ def _color_term(scene: Scene) -> str:
     )
 
 
-def _light_terms(scene: Scene, is_diffuse: bool) -> Iterator[str]:
-    for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
+def _light_terms(scene: Scene) -> Iterator[str]:
+    for kind, name in LIGHTS.items():
         if count := sum(isinstance(light, kind) for light in scene.lights):
             yield f"transmittance towards {_count(count, name)}"
-    ambient = "by quadrature over 50 directions"
-    if is_diffuse:
-        ambient = "as inflow of the diffusion through the box's faces"
     for light in scene.lights:
-        if isinstance(light, BeamLight):
-            radius = float(seen_radius(light.radius, max(scene.volume.grid.spacing)))
-            yield f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
-        elif isinstance(light, EnvironmentLight):
+        if isinstance(light, EnvironmentLight):
             (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
             beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
-            sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
-            yield f"environment map {width} x {height}: {beams}{sky}"
+            yield f"environment map {width} x {height}: {beams}{_count(directions, 'direction')}"
     if any(isinstance(light, AmbientLight) for light in scene.lights):
-        yield f"ambient light, {ambient}"
-
-
-def _ground_terms(scene: Scene) -> Iterator[str]:
-    """A ground, and on what it and the volume light each other."""
-    ground = scene.ground
-    if ground is None:
-        return
-    albedo = _listed(ground.mean_albedo, is_by_cell=False)
-    if ground.albedo.ndim > 1:
-        rows, columns = ground.albedo.shape[1:]
-        albedo += f" in the mean of {columns} x {rows} pixels"
-    yield (
-        f"ground at {'zyx'[ground.plane.axis]} = {ground.plane.height:g}, albedo {albedo}: direct "
-        f"light ray by ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
-        f"to and fro in {_cells(exchange_grid(scene)[0])}"
-    )
+        yield "ambient light"
+    if scene.ground is not None:
+        plane, albedo = scene.ground.plane, _listed(scene.ground.mean_albedo, is_by_cell=False)
+        yield f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}"
 
 
 def _diffuse_terms(medium: Medium, scene: Scene) -> Iterator[str]:
@@ -183,3 +179,90 @@ def _listed(numbers: Tensor, is_by_cell: bool) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' if number > 1 else ''}"
+
+
+def find_doubts(scene: Scene) -> list[str]:
+    """A line about each number of `scene` that can hardly be meant; parameters are at their start.
+
+    Where the density starts as nothing, optical depths are those of a density of 1.
+    """
+    volume = with_values(scene, scene.starts).volume
+    extinction = extinction_of(volume).amax(0)
+    return [
+        *_doubt_depth(volume, extinction),
+        *_doubt_faces(volume, extinction, scene.diffusion),
+        *_doubt_cameras(scene),
+        *_doubt_ground(scene),
+    ]
+
+
+def _doubt_depth(volume: Volume, extinction: Tensor) -> Iterator[str]:
+    density, where = volume.density, "through the densest part"
+    if not bool(density.any()):
+        density, where = torch.ones_like(density), "at a density of 1"
+    # The thickest line of cells along each axis.
+    lines = [float((extinction * density).sum(axis).max()) for axis in range(3)]
+    depths = [line * size for line, size in zip(lines, volume.grid.spacing, strict=True)]
+    if min(depths) > THICKEST or max(depths) < THINNEST:
+        yield f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"
+
+
+def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings) -> Iterator[str]:
+    """Whether a medium that scatters is thick in cells at the faces of the box.
+
+    What counts is the depth without the forward peak, and more of it where light is absorbed.
+    """
+    if not bool((volume.sigma_s > 0).any()):
+        return
+    medium = scale_medium(volume, settings.angles)
+    finer = volume.grid.refine(settings.times, settings.refine_along)
+    lost = medium.extinction.value
+    lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
+    thickest, depth = (
+        max(
+            float(field.select(axis - 3, end).max()) * size
+            for axis, size in enumerate(finer.spacing)
+            for end in (0, -1)
+        )
+        for field in (lost, extinction * volume.density)
+    )
+    if thickest > THICK_FACES:
+        times, g = thickest / THICK_FACES, float(medium.g.max())
+        advice = f"take cells {times:.1f} times smaller, and leave a layer of empty ones"
+        if g >= FORWARD:
+            advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
+        cells = f"cells at the faces of the box are up to {depth:.3g} optical depths thick"
+        yield f"volume: {cells}; images may be off by a fifth and more: {advice}"
+
+
+def _doubt_cameras(scene: Scene) -> Iterator[str]:
+    small, inside = list[str](), list[str]()
+    for view in scene.views:
+        camera, place = view.camera, view.camera.pose[:, 3].double()
+        low, high = (place.new_tensor(corner) for corner in scene.volume.grid.bounds_xyz)
+        distance = float(torch.dist((low + high) / 2, place)) if camera.is_perspective else 1.0
+        # The diagonal of the box, seen from the side, takes hardly any pixels.
+        width = 2 * float(camera.half_width) * distance
+        if float(torch.dist(low, high)) * camera.size[1] < SMALLEST * width:
+            small.append(view.name)
+        if camera.is_perspective and bool(((low < place) & (place < high)).all()):
+            inside.append(view.name)
+    faults = ("the box is smaller than a pixel or two to", small), ("inside the box:", inside)
+    for fault, names in faults:
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            yield f"views: {fault} camera {names[0]}{more}; {UNITS}"
+
+
+def _doubt_ground(scene: Scene) -> Iterator[str]:
+    """Lights that a ground hides, and cameras that lie on their side."""
+    if scene.ground is None:
+        return
+    plane, up = scene.ground.plane, 2 - scene.ground.plane.axis
+    tilted = [v.name for v in scene.views if abs(float(v.camera.pose[up, 0])) > UPRIGHT]
+    if tilted:
+        yield f"ground: volume.up is {'xyz'[up]}, and camera {tilted[0]} lies on its side"
+    for index, light in enumerate(scene.lights):
+        if not isinstance(light, EnvironmentLight) and not stay_above([light], plane):
+            below = f"below the ground at {plane.height:g}"
+            yield f"lights.{index}: shines from {below}, and is not seen"

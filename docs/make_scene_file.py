@@ -18,10 +18,10 @@ from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 from ddrecon import settings
-from ddrecon.records import alternatives, is_required, type_hints
+from ddrecon.records import LIMITS, alternatives, is_required, type_hints
 from ddrecon.scene_file import schema, view_schema
 from ddrecon.scene_file.read import describe_type
-from ddrecon.variables.kinds import KINDS, Kind
+from ddrecon.variables.kinds import KINDS
 
 FOLDER = Path(__file__).parent
 EXPERT = """\
@@ -45,12 +45,28 @@ Small scenes with other phase functions, models and losses are in `configs/kinds
 
 Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json).
 Its place is the file's first line: `# yaml-language-server: $schema=PATH/scene.schema.json`."""
+PARAMETERS = """\
+## Names of parameters
+
+What can be found.
+N is the place of a light in its list, counted from 0.
+NAME is a view's name, or `*` for all training views.
+Where there are two media, `media.cloud.density` is as `density` is, and so on.
+Colors have entries `.r`, `.g`, `.b`; places and directions have `.x`, `.y`, `.z`.
+A lens has its coefficients, `.k1` and so on.
+A `camera` has `.rotation_x` ... and `.x` ...: a rotation about the middle of the box [radians], \
+then a shift [u], both in its axes (right, up, backward).
+A `focal` length is in widths of the image.
+`render --gradient` and `gradcheck --parameter` take the same names.
+
+| name | kept within | by color | from cell to cell |
+|---|---|---|---|"""
 SECTIONS: list[tuple[str, type]] = [
     ("volume", schema.VolumeSection),
     ("volume: {media: ...}", schema.MixtureSection),
     ("volume.media.NAME", schema.MediumSection),
     ("volume.density, sigma_a, ...: {file: ...}", settings.FieldFile),
-    ("volume.density, sigma_a, ...: {heights: ...}", schema.Profile),
+    ("volume.density, sigma_a, ...: {heights: ...}", schema.ByHeight),
     ("volume.density, sigma_a, ...: {labels: ...}", schema.ByLabel),
     ("volume.sigma_t: {meters: ...}", schema.Water),
     ("volume.phase: {type: henyey_greenstein}", schema.HenyeyGreensteinSection),
@@ -136,21 +152,15 @@ def _joined(entries: Iterable[tuple[str, str]]) -> list[str]:
     names: dict[str, list[str]] = {}
     for name, text in entries:
         names.setdefault(text, []).append(f"`{name}`")
-    return [f"| {', '.join(each)} | {text} |" for text, each in names.items()]
+    return [f"| {', '.join(group)} | {text} |" for text, group in names.items()]
 
 
 def _takes(hint: Any, field: Field[Any]) -> str:
     """What a key takes, in words, with its limits."""
-    limits = {key: value for key, value in field.metadata.items() if value is not None}
+    limits = field.metadata
     if "choices" in limits:
         return ", ".join(f"`{choice}`" for choice in limits["choices"])
-    words = {
-        "minimum": "at least {:g}",
-        "above": "above {:g}",
-        "maximum": "at most {:g}",
-        "below": "below {:g}",
-    }
-    within = [words[key].format(value) for key, value in limits.items() if key in words]
+    within = [f"{LIMITS[key][0]} {limits[key]:g}" for key in limits if key in LIMITS]
     return ", ".join([describe_type(hint), *within])
 
 
@@ -173,35 +183,10 @@ def _parameters() -> str:
     entries = []
     for name, kind in KINDS.items():
         by_color, by_cell = ("yes" if holds else "" for holds in (kind.is_color, kind.is_cellwise))
-        entries.append((name, f"{_limits(kind)} | {by_color} | {by_cell}"))
-    rows = _joined(entries)
-    return "\n".join(
-        [
-            "## Names of parameters",
-            "",
-            "What can be found.",
-            "N is the place of a light in its list, counted from 0.",
-            "NAME is a view's name, or `*` for all training views.",
-            "Where there are two media, `media.cloud.density` is as `density` is, and so on.",
-            "Colors have entries `.r`, `.g`, `.b`; places and directions have `.x`, `.y`, `.z`.",
-            "A lens has its coefficients, `.k1` and so on.",
-            "A `camera` has `.rotation_x` ... and `.x` ...: a rotation about the middle of the box"
-            " [radians], then a shift [u], both in its axes (right, up, backward).",
-            "A `focal` length is in widths of the image.",
-            "`render --gradient` and `gradcheck --parameter` take the same names.",
-            "",
-            "| name | kept within | by color | from cell to cell |",
-            "|---|---|---|---|",
-            *rows,
-        ]
-    )
-
-
-def _limits(kind: Kind) -> str:
-    """What values of a `kind` are kept within, in words."""
-    if kind.low == -math.inf:
-        return ""
-    return f"{kind.low:g} to {kind.high:g}" if kind.high < math.inf else f"at least {kind.low:g}"
+        within = f"at least {kind.low:g}" if kind.low > -math.inf else ""
+        within = f"{kind.low:g} to {kind.high:g}" if kind.high < math.inf else within
+        entries.append((name, f"{within} | {by_color} | {by_cell}"))
+    return "\n".join([PARAMETERS, *_joined(entries)])
 
 
 NUMBERS = {
@@ -216,62 +201,56 @@ PLAIN = {NoneType: "null", bool: "boolean", int: "integer", float: "number", str
 def json_schema() -> str:
     """The scene file as a JSON schema, which editors know; a line for each record."""
     defined: dict[str, Any] = {}
-    _define(schema.SceneTree, defined)
+    _one(schema.SceneTree, {}, defined)
     lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in defined.items()]
     head = '"$schema": "https://json-schema.org/draft/2020-12/schema", "$ref": "#/$defs/SceneTree"'
     return f'{{{head}, "$defs": {{\n' + ",\n".join(lines) + "\n}}\n"
 
 
-def _define(record: type, defined: dict[str, Any]) -> None:
-    """Puts `record`, and all that it refers to, into `defined`."""
+def _define(record: type, defined: dict[str, Any]) -> dict[str, Any]:
+    """A reference to `record`, which is put into `defined` with all that it refers to."""
+    reference = {"$ref": f"#/$defs/{record.__name__}"}
     if record.__name__ in defined:
-        return
+        return reference
     sentences = explain(record)[1]
     tag = {"type": {"const": record.type}} if hasattr(record, "type") else {}
     entry: dict[str, Any] = {"type": "object", "additionalProperties": False, "properties": tag}
     defined[record.__name__] = entry
-    entry["required"] = [*tag]
+    entry["required"] = [*tag, *(field.name for field in fields(record) if is_required(field))]
     for field in fields(record):
         hints = [*alternatives(type_hints(record)[field.name]), *field.metadata.get("also", ())]
         about = {"description": sentences[field.name]}
-        entry["properties"][field.name] = about | _any_of(hints, field.metadata, defined)
-        if is_required(field):
-            entry["required"].append(field.name)
+        tag[field.name] = about | _any_of(hints, field.metadata, defined)
+    return reference
 
 
 def _any_of(hints: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
-    each = [_one(hint, limits, defined) for hint in hints]
+    schemas = [_one(hint, limits, defined) for hint in hints]
     if settings.FieldFile in hints and float in hints:
         number = _one(float, limits, defined)
-        each.append(
+        schemas.append(
             {"type": "object", "properties": {"constant": number}, "required": ["constant"]}
         )
-    return each[0] if len(each) == 1 else {"anyOf": each}
+    return schemas[0] if len(schemas) == 1 else {"anyOf": schemas}
 
 
 def _one(hint: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
-    arguments = get_args(hint)
+    arguments, origin = get_args(hint), get_origin(hint)
     if is_dataclass(hint):
-        _define(hint, defined)  # type: ignore[arg-type]
-        return {"$ref": f"#/$defs/{hint.__name__}"}  # type: ignore[union-attr]
-    if get_origin(hint) is Literal:
+        return _define(hint, defined)  # type: ignore[arg-type]
+    if origin is Literal:
         return {"enum": list(arguments)}
-    if get_origin(hint) is tuple:
-        size = {} if arguments[-1] is Ellipsis else {"minItems": len(arguments)}
-        size |= {"maxItems": size["minItems"]} if size else {}
-        return {
-            "type": "array",
-            "items": _any_of(alternatives(arguments[0]), limits, defined),
-        } | size
-    if get_origin(hint) is Mapping:
+    if origin is tuple:
+        count = len(arguments)
+        size = {} if arguments[-1] is Ellipsis else {"minItems": count, "maxItems": count}
+        items = _any_of(alternatives(arguments[0]), limits, defined)
+        return {"type": "array", "items": items} | size
+    if origin is Mapping:
         return {"type": "object", "additionalProperties": _any_of([arguments[1]], {}, defined)}
     if hint in (int, str) and "choices" in limits:
         return {"enum": list(limits["choices"])}
-    kind = {"type": PLAIN.get(hint, "string")}
-    within = {
-        NUMBERS[key]: value for key, value in limits.items() if key in NUMBERS and value is not None
-    }
-    return kind | within if hint in (int, float) else kind
+    within = {NUMBERS[key]: value for key, value in limits.items() if key in NUMBERS}
+    return {"type": PLAIN.get(hint, "string")} | (within if hint in (int, float) else {})
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.autograd.graph import saved_tensors_hooks
 
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
@@ -17,12 +18,11 @@ from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
-from ddrecon.numerics.legendre import legendre
+from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.tangents import varied
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import varied, with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -194,6 +194,20 @@ def assert_derivatives(
             for step in (1e-5, -1e-5)
         )
     assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
+
+
+def count_kept(function: Callable[[], Tensor], least: int) -> int:
+    """How many tensors of `least` numbers or more `function` keeps for its backward pass."""
+    kept = dict[int, Tensor]()
+
+    def note(tensor: Tensor) -> Tensor:
+        if tensor.numel() >= least:
+            kept[tensor.data_ptr()] = tensor.detach()
+        return tensor
+
+    with saved_tensors_hooks(note, lambda tensor: tensor):
+        assert function().requires_grad
+    return len(kept)
 
 
 def data_matrix(

@@ -1,15 +1,24 @@
 """Small scenes that need all kernels and kinds of derivatives, built in Python."""
 
 from dataclasses import replace
+from typing import Any
 
 from media import half_empty, make_camera, make_scene, random_values, tensor
 
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase import TwoLobe
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 
 SHAPE = (5, 6, 7)
+VIEWS: dict[str, dict[str, Any]] = {
+    "perspective": {},
+    "oblique": {"eye": (1.5, 1.2, 1.8)},
+    "orthographic": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
+    "inside": {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
+    "grazing": {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
+}
+"""Cameras, as `make_camera` takes them."""
 
 
 def sky(directions: int = 6) -> EnvironmentLight:

@@ -60,7 +60,7 @@ class Tape(TorchDispatchMode):
 
 
 def record(computation: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
-    """As `ddrecon.kernels.graphs.GraphRecorder`, on a processor."""
+    """As `ddrecon.reconstruct.recording.GraphRecorder`, on a processor."""
     from ddrecon.kernels import launch  # imports Warp
 
     computation()

@@ -6,9 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as some
-from media import half_empty, make_camera, make_scene, random_values, tensor
+from media import half_empty, make_camera, make_scene, random_values
 from scenes import lamp, sky
 from torch import Tensor
 from torch.autograd import forward_ad as forward
@@ -23,7 +21,6 @@ from twins import (
 
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.layer import VolumeRenderer
-from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -57,85 +54,6 @@ def test_engines_agree_on_every_kind_of_config(config: Path) -> None:
     assert_render_twins(scene, variables_of(scene))
 
 
-MEDIA = {
-    "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,)},
-    "colored": {},
-    "cellwise": {},
-    "black": {"sigma_s": (0.0,), "model": "none"},
-}
-"""Kinds of media; fused kernels are compiled for each, and for each kind of lights."""
-LIGHTS = {
-    "beam": {},
-    "gray beam": {"directional": (2.0,)},
-    "ambient": {"directional": None, "ambient": (0.4, 0.3, 0.2)},
-    "points": {"ambient": (0.3,)},
-    "sky": {"directional": None},
-}
-KINDS = [("gray", "gray beam"), ("colored", "beam"), ("colored", "sky"), ("black", "points")]
-KINDS += [("cellwise", "points"), ("cellwise", "ambient")]
-VIEWS = {
-    "far": {"eye": (0.3, 0.4, 3.0), "half_width": 0.25},
-    "near": {"eye": (1.1, 0.5, 0.9), "half_width": 0.9},
-    "inside": {"eye": (0.1, 0.12, 0.05), "half_width": 0.6},
-    "parallel": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
-}
-
-
-@some.composite
-def scenes(draw: Any) -> Scene:
-    """A small scene; its numbers come from seeds, its kind and settings one by one."""
-    kind, lit = draw(some.sampled_from(KINDS))
-    shape = tuple(draw(some.integers(2, 9)) for _ in range(3))
-    seed = draw(some.integers(0, 99))
-    density = draw(some.sampled_from([0.0, 0.3, 2.0])) * half_empty(*shape, seed=seed)
-    size = (draw(some.integers(2, 24)), draw(some.integers(2, 24)))
-    view = VIEWS[draw(some.sampled_from(sorted(VIEWS)))]
-    model = draw(some.sampled_from(["p1", "p1", "flux_limited"]))
-    changes = {"model": model, **MEDIA[kind], **LIGHTS[lit]}
-    if changes["model"] == "p1":
-        changes["transport_rounds"] = draw(some.integers(0, 2))
-        changes["closure"] = draw(some.sampled_from(["geometric", "smooth"]))
-    if kind == "cellwise":
-        for step, (name, most) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1):
-            changes[name] = most * random_values(3, *shape, seed=seed + step)
-    scene = make_scene(
-        density,
-        g=draw(some.sampled_from([0.0, 0.4, 0.85, -0.3])),
-        camera=make_camera(size=size, **view),
-        tolerance=1e-14,
-        **changes,
-    )
-    if lit == "points":
-        beam = tensor(0.1, 1.0, 0.05), tensor(-0.2, -1.0, -0.1), tensor(0.5), tensor(0.2)[0]
-        scene.lights += [
-            lamp(),
-            PointLight(tensor(0.1, 0.05, -0.1), tensor(0.3)),
-            BeamLight(*beam),
-        ]
-    if lit == "sky":
-        scene.lights.append(sky())
-    render = RenderSettings(
-        samples_per_pixel=draw(some.sampled_from([1, 2])),
-        steps_per_voxel=draw(some.sampled_from([1, 2])),
-        tolerance=draw(some.sampled_from([0.0, 1.0])),
-    )
-    return replace(scene, render=render)
-
-
-@settings(
-    max_examples=4,
-    derandomize=True,
-    database=None,
-    phases=[Phase.generate],
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(scene=scenes(), has_moved=some.booleans())
-def test_engines_agree_on_scenes_drawn_at_random(scene: Scene, has_moved: bool) -> None:
-    names = variables_of(scene)
-    still = [name for name in names if not name.endswith("camera")]
-    assert_render_twins(scene, names if has_moved else still)
-
-
 SHAPE = (5, 6, 7)
 CELLS = {"sigma_a": random_values(3, *SHAPE, seed=1), "sigma_s": random_values(3, *SHAPE, seed=2)}
 GLOW = half_empty(3, *SHAPE, seed=4)
@@ -149,11 +67,13 @@ CASES: dict[str, dict[str, Any]] = {
     "forward, degree 3": {"g": 0.4, "degree": 3, "transport_rounds": 2, "closure": "smooth"},
     "backward, degree 3": {"g": -0.6, "degree": 3, "transport_rounds": 2, "ambient": (0.3,)},
     "backward, parts": {"g": -0.6, "transport_rounds": 2, "receive": 3},
+    "flux limited": {"model": "flux_limited", "g": 0.4, "ambient": (0.3,)},
+    "black": {"sigma_s": (0.0,), "model": "none", "ambient": (0.3,)},
     "cells": {"g": 0.3, "transport_rounds": 1, "ambient": (0.3,), "emission": GLOW[:1], **CELLS},
 }
 MOVES = "camera", "direction"
 """Ends of names of variables that move rays and beams."""
-EVERY_LIGHT = "cells", "forward, degree 1"
+EVERY_LIGHT = "cells", "forward, degree 1", "black"
 """Cases that have point lights and a sky besides."""
 
 

@@ -15,7 +15,7 @@ import ddrecon
 from ddrecon.cameras import Pane
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
-from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transmitted_moments
+from ddrecon.medium.optics import face_resistance, reflectance, refract, transmitted_moments
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
@@ -69,14 +69,18 @@ def test_an_index_of_nearly_one_changes_nearly_nothing(changes: dict[str, Any]) 
 
 
 CLEAR = {"sigma_s": (0.0,), "transport_rounds": 1}
+HOT = {"sigma_a": (2.0,), "transport_rounds": 1}
 
 
-@pytest.mark.parametrize("changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}, CLEAR])
+@pytest.mark.parametrize(
+    "changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}, CLEAR, HOT]
+)
 def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any]) -> None:
-    """Where nothing scatters as well, since faces reflect light inside."""
+    """Where nothing scatters as well, since faces reflect light; and what is as hot glows so."""
     medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "directional": None, "ambient": (0.7,)}
     camera = make_camera((0.0, 0.0, 2.5), is_perspective=False)
     scene = within(1.4, random_values(5, 4, 6), camera=camera, **(medium | changes))
+    scene.volume.black_body = tensor(0.7)
     expected = torch.full((1, 5, 4, 6), 4 * math.pi * 0.7 * 1.4**2, dtype=torch.float64)
     torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
     seen, passed = ddrecon.render(scene), 1 - (0.4 / 2.4) ** 2
@@ -97,10 +101,9 @@ def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("light", ["down", "slanted", "ambient", "beam"])
+@pytest.mark.parametrize("light", ["down", "ambient", "beam"])
 def test_no_power_is_lost_or_made(light: str) -> None:
-    travel = (0.0, -1.0, 0.0) if light == "down" else (-2.0, -2.1, -1.0)
-    lights: dict[str, Any] = {"travel": travel, "directional": (3.0,)}
+    lights: dict[str, Any] = {"travel": (0.0, -1.0, 0.0), "directional": (3.0,)}
     lights = {"directional": None, "ambient": (1.0,)} if light == "ambient" else lights
     medium = {"sigma_a": (1.0,), "sigma_s": (4.0,), "g": 0.3, "degree": 5}
     density = 0.5 + random_values(6, 7, 5)

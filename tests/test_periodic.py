@@ -20,7 +20,7 @@ from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
 from ddrecon.light_field import fluence_of
 from ddrecon.lighting import fluence, solve_light
-from ddrecon.numerics.periods import MARGIN, unroll_along
+from ddrecon.numerics.layout import MARGIN, unroll_along
 from ddrecon.picture import render, view_image
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
@@ -107,7 +107,7 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
 @pytest.mark.parametrize("kind", KINDS)
 def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
     """The tangent is along both variables; light is followed through few periods."""
-    for room in ("numerics.periods", "march.box"):
+    for room in ("numerics.layout", "march.box"):
         monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
     scene = repeated(half_empty(*SHAPE), **KINDS[kind])
     values = values_of(scene, ["density", *(["g"] if KINDS[kind].get("g") else [])])
@@ -176,6 +176,14 @@ def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
     depth = 0.3 * 0.5 * 5 * CELL / direction[..., 1].abs()
     expected = (1 - torch.exp(-depth)) / (0.3 * 0.5)
     torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-10, atol=0)
+
+
+def test_a_glowing_layer_lights_the_ground_below_it():
+    """By 2 pi j times its height of 1; the ground shows half of that over pi."""
+    thin = {"sigma_a": (1e-6,), "sigma_s": (0.0,), "directional": None, "has_ground": True}
+    scene = repeated(even(4, 5, 3), emission=tensor(1.0), **thin)
+    ground = render(scene) - render(replace(scene, ground=None))
+    torch.testing.assert_close(ground, torch.ones_like(ground), rtol=0.15, atol=0)
 
 
 def test_a_period_is_the_middle_of_many():

@@ -17,6 +17,8 @@ from ddrecon.run.job import drive
 class FakeJob:
     """A job of so many iterations, which take no time."""
 
+    title = "optimize"
+
     def __init__(self, count: int):
         self.total, self.iteration = count, 0
 
@@ -36,7 +38,8 @@ def test_a_bar_of_80_columns_and_a_log(monkeypatch: pytest.MonkeyPatch, is_termi
     stderr.isatty = lambda: is_terminal  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stderr", stderr)
     monkeypatch.setenv("COLUMNS", "80")
-    drive(FakeJob(1000), None, "optimize", is_quiet=False)  # type: ignore[arg-type]
+    monkeypatch.setattr("ddrecon.progress._is_quiet", False)
+    drive(FakeJob(1000), None)  # type: ignore[arg-type]
     *states, last = stderr.getvalue().rstrip().split("\r")
     assert len(last) < 80 and last.endswith("PSNR 41.3/31.2 dB]")
     assert len(re.search(r"\|(.*)\|", last).group(1)) >= 10  # type: ignore[union-attr]
@@ -48,7 +51,8 @@ def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch
     reader, writer = pty.openpty()
     with os.fdopen(writer, "w") as terminal:
         monkeypatch.setattr("sys.stderr", terminal)
-        for _ in tqdm(range(2), **bar_settings(is_quiet=False)):
+        monkeypatch.setattr("ddrecon.progress._is_quiet", False)
+        for _ in tqdm(range(2), **bar_settings()):
             pass
     told = b""
     with suppress(OSError):  # which says that the terminal was closed

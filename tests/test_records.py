@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import pytest
 
+from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.losses import LOSSES
 from ddrecon.records import bounded, faults_of, one_of
+from ddrecon.scene_file.view_schema import FisheyeSection, OpencvSection
+from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
+from ddrecon.transport.sweep import DIRECTIONS
 
 
 @dataclass(frozen=True)
@@ -57,3 +62,23 @@ WRONG: list[tuple[dict[str, Any], str, str]] = [
 @pytest.mark.parametrize(("changes", "key", "what"), WRONG, ids=str)
 def test_what_is_not_is_told_with_its_key(changes: dict[str, Any], key: str, what: str) -> None:
     assert [*faults_of(replace(Tree(), **changes), "tree")] == [(f"tree.{key}", what)]
+
+
+@pytest.mark.parametrize(
+    ("record", "key", "table"),
+    [
+        (DiffusionSettings, "closure", CLOSURES),
+        (DiffusionSettings, "degree", DIRECTIONS),
+        (OptimizeSettings, "loss", LOSSES),
+    ],
+)
+def test_a_scene_may_ask_for_whatever_is_in_a_table(
+    record: type, key: str, table: Iterable[object]
+) -> None:
+    choices = {field.name: field.metadata.get("choices") for field in fields(record)}
+    assert list(choices[key]) == list(table)
+
+
+@pytest.mark.parametrize("section", [OpencvSection, FisheyeSection])
+def test_a_lens_has_its_coefficients_in_order(section: type) -> None:
+    assert LENSES[section.type] == tuple(field.name for field in fields(section))

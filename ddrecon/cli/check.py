@@ -1,4 +1,4 @@
-"""What `ddrecon check` reports of a scene."""
+"""What `ddrecon check` tells of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ddrecon.engine import current_engine
 from ddrecon.errors import DdreconError, SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes
-from ddrecon.reconstruct.pace import time_iteration
+from ddrecon.reconstruct.loop import time_iteration
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import (
     Support,
@@ -21,13 +21,12 @@ from ddrecon.reconstruct.support import (
     find_support,
     support_text,
 )
+from ddrecon.run.job import Told
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
-from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
-from ddrecon.terms import needed_terms
-from ddrecon.turntable import upright_axis
+from ddrecon.terms import find_doubts, needed_terms
 from ddrecon.variables.values import with_values
 
 TOO_WIDE = 8.0
@@ -64,47 +63,35 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
     return supports
 
 
-def asks_support(scene: Scene) -> bool:
-    """Whether `scene` asks for a support of its density."""
-    density = scene.optimize.parameters.get("density") if scene.optimize else None
-    return density is not None and density.support is not None
+def describe(scene: Scene, supports: Sequence[Support] = ()) -> Told:
+    """Tells of `scene` its grid, physics, engine, time and so on, and what can hardly be meant.
 
-
-def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: its grid, physics, engine, time and so on.
-
-    And what can hardly be meant. Its parameters are where they start. `up` is `volume.up`.
+    Its parameters are where they start.
     """
     built, scene = scene, with_values(scene, scene.starts)
-    grid, train = scene.volume.grid, select_views(scene, is_test=False)
-    low, high = grid.bounds_xyz
-    loss, seconds = None, None
-    if scene.optimize is not None and train.views:
-        loss = describe_loss(scene.optimize, train)
+    grid, train, settings = scene.volume.grid, select_views(scene, is_test=False), scene.optimize
+    loss, seconds, support = None, None, None
+    if settings is not None and train.views:
+        loss = describe_loss(settings, train)
         with suppress(DdreconError):  # what is wrong is told by a run
             seconds = time_iteration(built)
-    support = None
-    with suppress(SceneError) if not asks_support(scene) else nullcontext():
-        upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
-        support = describe_support(supports, grid, upright)
+    density = settings.parameters.get("density") if settings is not None else None
+    is_asked = density is not None and density.support is not None
+    with nullcontext() if is_asked else suppress(SceneError):
+        support = describe_support(supports, grid)
         if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
-    return {
-        "resolution": list(reversed(grid.shape)),
-        "bounds": [list(low), list(high)],
-        "voxel": list(reversed(grid.spacing)),
-        "views": [
-            {
-                "name": view.name,
-                "camera": "perspective" if view.camera.is_perspective else "orthographic",
-                "width": view.camera.size[1],
-                "height": view.camera.size[0],
-                "split": "test" if view.is_test else "train",
-                "has_image": view.image is not None,
-                "cell": cell_width(grid, view.camera),
-            }
-            for view in scene.views
-        ],
+    low, high = (list(corner) for corner in grid.bounds_xyz)
+    cells, sides = list(reversed(grid.shape)), list(reversed(grid.spacing))
+    lines = [f"grid: {sizes_text(cells)} cells of {sizes_text(sides)} u, from {low} to {high}"]
+    views, texts = _describe_views(scene)
+    lines += [f"views: {len(views)}", *texts]
+    widths = [view["cell"] for view in views]
+    report: dict[str, Any] = {
+        "resolution": cells,
+        "bounds": [low, high],
+        "voxel": sides,
+        "views": views,
         "physics": needed_terms(scene),
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
@@ -112,47 +99,46 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> d
         "engine": current_engine(),
         "memory_bytes": memory_estimate(scene),
         "iteration_seconds": seconds,
-        "iterations": scene.optimize and scene.optimize.iterations,
+        "iterations": settings and settings.iterations,
         "doubts": find_doubts(scene),
     }
+    least, most = min(widths), max(widths)
+    lines.append(f"cells: {least:.2g} to {most:.2g} pixels wide{_advise_on_cells(least)}")
+    lines += ["physics:", *(f"  {term}" for term in report["physics"])]
+    counts = report["optimizes"].items()
+    sought = [f"{name} ({count:,} number{'s' if count > 1 else ''})" for name, count in counts]
+    lines.append(f"optimizes: {', '.join(sought) or 'nothing'}")
+    lines += [loss_text(loss)] if loss else []
+    lines += [support_text(support)] if support and "cells" in support else []
+    memory = gibibytes(report["memory_bytes"])
+    lines.append(f"engine: {report['engine']}")
+    lines.append(f"memory: about {memory} at the peak, besides torch itself")
+    if seconds and settings is not None:
+        # A run that ends by itself makes about a hundred.
+        count = 100 if settings.iterations == AUTO else settings.iterations
+        whole = f"at most {count * seconds / 60:.2g} minutes for {count}"
+        lines.append(f"time: about {seconds:.2g} s an iteration at full resolution, {whole}")
+    return report, lines
 
 
-def lines(report: dict[str, Any]) -> list[str]:
-    """The report of `describe` as lines of text."""
-    low, high = report["bounds"]
-    sizes = f"{sizes_text(report['resolution'])} cells of {sizes_text(report['voxel'])} u"
-    parameters = [
-        f"{name} ({count:,} number{'s' if count > 1 else ''})"
-        for name, count in report["optimizes"].items()
-    ]
-    views = [
-        f"  {view['name']}: {view['camera']}, {view['width']} x {view['height']} pixels,"
-        f" {view['split']}{', with image' if view['has_image'] else ''}"
-        for view in report["views"]
-    ]
-    widths = [view["cell"] for view in report["views"]]
-    return [
-        f"grid: {sizes}, from {low} to {high}",
-        f"views: {len(report['views'])}",
-        *views,
-        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide{_advise_on_cells(min(widths))}",
-        "physics:",
-        *(f"  {term}" for term in report["physics"]),
-        f"optimizes: {', '.join(parameters) or 'nothing'}",
-        *([loss_text(report["loss"])] if report["loss"] else []),
-        *([support_text(report["support"])] if report["support"] else []),
-        f"engine: {report['engine']}",
-        f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
-        *([_time_text(report)] if report["iteration_seconds"] else []),
-    ]
-
-
-def _time_text(report: dict[str, Any]) -> str:
-    """How long iterations take, and as many as were asked for, or a hundred of a run by itself."""
-    seconds, count = report["iteration_seconds"], report["iterations"]
-    count = 100 if count == AUTO else count
-    whole = f"at most {count * seconds / 60:.2g} minutes for {count}"
-    return f"time: about {seconds:.2g} s an iteration at full resolution, {whole}"
+def _describe_views(scene: Scene) -> tuple[list[dict[str, Any]], list[str]]:
+    """What is told of each view, and a line of it."""
+    views, lines = list[dict[str, Any]](), list[str]()
+    for view in scene.views:
+        camera = view.camera
+        told = {
+            "name": view.name,
+            "camera": "perspective" if camera.is_perspective else "orthographic",
+            "width": camera.size[1],
+            "height": camera.size[0],
+            "split": "test" if view.is_test else "train",
+            "has_image": view.image is not None,
+            "cell": cell_width(scene.volume.grid, camera),
+        }
+        views.append(told)
+        text = "  {name}: {camera}, {width} x {height} pixels, {split}".format(**told)
+        lines.append(text + (", with image" if told["has_image"] else ""))
+    return views, lines
 
 
 def _advise_on_cells(width: float) -> str:

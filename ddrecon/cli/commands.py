@@ -9,9 +9,8 @@ from itertools import pairwise
 import click
 
 from ddrecon import __version__
-from ddrecon.cli.file_commands import export, import_, info
 from ddrecon.cli.scene_commands import balance, check, optimize, render, uncertainty
-from ddrecon.cli.validation_commands import bench, gradcheck, reference
+from ddrecon.cli.tool_commands import bench, export, gradcheck, import_, info, reference
 from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
 
@@ -67,7 +66,6 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-OF_SCENES = check, render, balance, optimize, uncertainty
-ALL = (*OF_SCENES, gradcheck, reference, bench, export, import_, info)
-for command in ALL:
+ALL = (check, render, balance, optimize, uncertainty, gradcheck, reference, bench, export, import_)
+for command in (*ALL, info):
     main.add_command(command)

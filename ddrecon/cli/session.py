@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder, claim_folder
-from ddrecon.progress import bar_settings
+from ddrecon.progress import be_quiet, show_progress
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT, require_no_film
 from ddrecon.scene_file.load import SceneFile, read_scene
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 """Where `--json` without a file sends a report."""
+NOWHERE = Path(os.devnull)
+"""The output folder of commands that have none."""
 
 
 @dataclass
@@ -44,6 +46,9 @@ class Session:
     torch is set up where a scene is built, not before: what is wrong with its file is said at once.
     """
 
+    output: Path = NOWHERE
+    overwrite: bool = False
+    resume: bool = False
     overrides: tuple[str, ...] = ()
     device: str = "cpu"
     engine: str | None = None
@@ -78,7 +83,9 @@ class Session:
         join_ranks(has_gpu)
         log = logging.getLogger(LOG)
         log.handlers = [_AboveBars()]
-        log.setLevel(logging.ERROR if self.is_quiet else logging.INFO)
+        is_quiet = self.quiet or not is_first()  # of several ranks the first alone shows progress
+        be_quiet(is_quiet)
+        log.setLevel(logging.ERROR if is_quiet else logging.INFO)
         use_engine(self.engine or current_engine())
         self.place = torch.device("cuda" if has_gpu else "cpu")
         if has_gpu and rank_count() > 1:
@@ -97,11 +104,6 @@ class Session:
         torch.manual_seed(self.seed)
         return self.place
 
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no progress is shown; of several ranks the first alone shows it."""
-        return self.quiet or not is_first()
-
     def with_override(self, override: str, option: str) -> Session:
         """The same session with one more override of the scene file, which an `option` says."""
         options = {**self.options, override: option}
@@ -119,13 +121,11 @@ class Session:
         file = path / RESULT if os.path.isdir(path) else path
         return read_scene(file, self.overrides, self.options)
 
-    def claim(
-        self, path: Path, kind: str, *, overwrite: bool, resume: bool = False
-    ) -> AbstractContextManager[Folder | None]:
-        """The folder `path` of a job of this `kind`, claimed; None where another rank has it."""
+    def claim(self, kind: str) -> AbstractContextManager[Folder | None]:
+        """The output folder of a job of this `kind`, claimed; None where another rank has it."""
         if not is_first():
             return nullcontext()
-        return claim_folder(path, kind, overwrite=overwrite, resume=resume)
+        return claim_folder(self.output, kind, overwrite=self.overwrite, resume=self.resume)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.
@@ -136,7 +136,7 @@ class Session:
         import torch
 
         from ddrecon.scene_file.build import build_scene
-        from ddrecon.scene_file.doubts import find_doubts
+        from ddrecon.terms import find_doubts
 
         dtype = dtype or getattr(torch, self.dtype)
         scene = build_scene(scene_file, dtype=dtype, device=place)
@@ -144,26 +144,19 @@ class Session:
             warnings.warn(doubt, DataWarning, 2)
         return scene
 
-    def empty(self) -> torch.Tensor:
-        """A tensor without numbers, of the type and on the device of a scene's."""
-        place = self.start()
-        import torch
-
-        return torch.empty(0, dtype=getattr(torch, self.dtype), device=place)
-
     def load(self, path: Path) -> Scene:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))
 
-    def progress(self, items: Sequence[Any], text: str) -> Iterable[Any]:
-        """`items` with a progress bar on stderr, unless quiet."""
-        return tqdm(items, desc=text, leave=False, **bar_settings(self.is_quiet))
+    progress = staticmethod(show_progress)
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""
         if not is_first():
             return
         prints_json = self.report == STDOUT
+        if self.output != NOWHERE:
+            lines = [*lines, f"written to {self.output}, {monotonic() - self.begun:.1f} s in all"]
         click.echo(json.dumps(report, indent=1) if prints_json else "\n".join(lines))
         if self.report is not None and not prints_json:
             write_json(self.report, report)

@@ -12,8 +12,8 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES
 from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.periods import apply_around
-from ddrecon.numerics.third_order import second_difference
+from ddrecon.numerics.interpolation import second_difference
+from ddrecon.numerics.layout import apply_around
 
 THIN = 1.5
 """Optical depths of a cell up to which light is as good as straight in it."""
@@ -30,7 +30,7 @@ def average_cells(medium: Medium) -> Medium:
 def average(field: Tensor) -> Tensor:
     """The mean in each cell of `field`, linear between centers and even beyond the outermost."""
     if is_fused():
-        from ddrecon.diffusion.fused.around import average_fused
+        from ddrecon.diffusion.fused.cells import average_fused
 
         return average_fused(field)
     for axis in AXES:
@@ -51,7 +51,7 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
         numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
         numbers = for_channels(numbers.T, len(means)).T
         fields = means, apply_around(bend, means, grid), extinction.field
-        (light,) = apply_cell("diffusion/fused/sharp.h", "Sharp", 1, numbers, *fields)
+        (light,) = apply_cell("diffusion/fused/cells.h", "Sharp", 1, numbers, *fields)
         return light
 
     def find() -> Tensor:
@@ -64,7 +64,7 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
 def bend(means: Tensor) -> Tensor:
     """The sum of second differences along all axes; at the ends of one it counts as 0."""
     if is_fused():
-        from ddrecon.diffusion.fused.around import bends_fused
+        from ddrecon.diffusion.fused.cells import bends_fused
 
         return bends_fused(means)
     bends = torch.zeros_like(means)

@@ -15,12 +15,11 @@ from functools import reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient
-from ddrecon.settings import FLOOR
+from ddrecon.numerics.interpolation import resize
 
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
@@ -37,19 +36,21 @@ GAP, NOTHING = 1.0, 1e-3
 layers are so small a part: beyond the medium nothing holds it up.
 """
 
+FLOOR = 3.3
+"""Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 
-def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
-    """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
-    least = floor / min(grid.extent)
+
+def smooth(transport_extinction: Tensor, grid: Grid) -> Tensor:
+    """D = 1 / (3 sqrt(kappa_tr^2 + (FLOOR / shortest side of the box)^2))."""
+    least = FLOOR / min(grid.extent)
     return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
 
 
-def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
+def geometric(transport_extinction: Tensor, grid: Grid) -> Tensor:
     """D = 1 / (3 kappa_tr + 4 / distance): collisions and spreading, two resistances in series.
 
-    See docs/theory.md, section 5. `distance` is that to the medium. `floor` is not used: nothing
-    here depends on the size of the box. Below zero, where only finite differences go, D is
-    continued to second order and stays positive.
+    See docs/theory.md, section 5. `distance` is that to the medium. Below zero, where only finite
+    differences go, D is continued to second order and stays positive.
     """
     # D = 1 / (spreading (1 + ratio)), with spreading = 4 / distance
     unit = transport_extinction.new_ones(())
@@ -76,18 +77,14 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
     # The haze, kappa_tr [1/u] that cells have besides their own.
     even = 3 * BACKGROUND / sum(grid.extent)
-    masses = [(term.scale, adaptive_avg_pool3d(term.field, coarse.shape)) for term in weight]
+    masses = [(term.scale, resize(term.field, coarse.shape, "area")) for term in weight]
     like = masses[0][1]
     potentials = even * _even_potential(coarse, like.dtype, like.device)
     total: float | Tensor = even * coarse.cells
     for scale, mass in masses:
         potentials = potentials + scale * potential(mass, coarse)
         total = total + scale * mass.sum((1, 2, 3), keepdim=True)
-    z, y, x = (
-        _weights(grid.shape[axis], few, like.dtype, like.device)
-        for axis, few in enumerate(coarse.shape)
-    )
-    return (z @ (y @ (potentials / total)).flatten(2)).unflatten(2, (len(y), -1)) @ x.mT
+    return resize(potentials / total, grid.shape, "linear")
 
 
 def _inverse_thickness(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
@@ -101,13 +98,6 @@ def _inverse_thickness(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     filled = (layers + NOTHING * haze) / (layers + haze)
     thickness = GAP * grid.spacing[axis] * filled.sum((1, 2, 3), keepdim=True)
     return (filled / thickness).expand(-1, *grid.shape).contiguous()
-
-
-@functools.lru_cache(maxsize=32)
-@torch.inference_mode(False)
-def _weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    unit = torch.eye(few, dtype=torch.float64)[None]
-    return interpolate(unit, size=cells, mode="linear")[0].mT.to(device, dtype)
 
 
 def potential(mass: Tensor, grid: Grid) -> Tensor:
@@ -155,7 +145,7 @@ def _along(line: Tensor, axis: int) -> Tensor:
     return line.view(shape)
 
 
-CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {
+CLOSURES: dict[str, Callable[[Tensor, Grid], Tensor]] = {
     "geometric": geometric,
     "smooth": smooth,
 }
@@ -167,7 +157,6 @@ class Closure:
 
     name: str
     grid: Grid
-    floor: float = FLOOR
 
     def __call__(self, transport_extinction: Tensor) -> Tensor:
-        return CLOSURES[self.name](transport_extinction, self.grid, self.floor)
+        return CLOSURES[self.name](transport_extinction, self.grid)

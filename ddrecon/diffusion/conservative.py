@@ -25,7 +25,7 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.fresnel import face_resistance
+from ddrecon.medium.optics import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
 
 
@@ -54,7 +54,7 @@ class DiffusionProblem:
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
         if is_fused() and isinstance(self.closure, Closure) and self.closure.name == "geometric":
-            from ddrecon.diffusion.fused.closure import close_medium
+            from ddrecon.diffusion.fused.cells import close_medium
 
             return close_medium(self.medium)
         return recompute(lambda: self.closure(self.medium.transport_extinction))
@@ -69,7 +69,7 @@ class DiffusionProblem:
         """A and the right side of E2.7."""
         medium, diffusion, (mean, first) = self.medium, self.diffusion, self._source
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import assemble_system
+            from ddrecon.diffusion.fused.cells import assemble_system
 
             *matrix, right = assemble_system(medium, diffusion, mean, first, self.outside)
         else:
@@ -92,18 +92,12 @@ class DiffusionProblem:
         fluxes = [moments for moments in (self._source[1], more) if moments is not None]
         first = reduce(torch.add, fluxes) if fluxes else None
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import find_flux
+            from ddrecon.diffusion.fused.cells import find_flux
 
             return find_flux(self.medium, self.diffusion, mean, first, self.outside, before)
-        along_axes = [None] * 3 if first is None else flux_along_axes(first)
-        moments = moments_of_flux(
-            [
-                recompute(
-                    _average_flux, self.medium, self.diffusion, flux, self.outside, mean, axis
-                )
-                for axis, flux in zip(AXES, along_axes, strict=True)
-            ]
-        )
+        faces = self._find_flow(first, mean)
+        pairs = zip(AXES, faces, strict=True)
+        moments = moments_of_flux([3 * face_average(flow, axis) for axis, flow in pairs])
         return moments if before is None else before + moments
 
     def right_side(self, source: Tensor, flux: Tensor | None) -> Tensor:
@@ -115,18 +109,31 @@ class DiffusionProblem:
         if flux is None:
             return right + source
         if self._is_fused:
-            from ddrecon.diffusion.fused.faces import spread_flux
+            from ddrecon.diffusion.fused.cells import spread_flux
 
             return spread_flux(self.medium, self.diffusion, flux, (right, source))
         return right + (source - self._spread(flux))
 
     def _spread(self, flux: Tensor) -> Tensor:
         """div(D kappa_s times a flux) of the moments `flux`."""
+        faces, spacing = self._find_flow(flux, None), self.medium.grid.spacing
         z, y, x = (
-            recompute(_divergence, self.medium, self.diffusion, along, axis)
-            for axis, along in zip(AXES, flux_along_axes(flux), strict=True)
+            flow.diff(dim=axis) / step
+            for axis, flow, step in zip(AXES, faces, spacing, strict=True)
         )
         return z + y + x
+
+    def _find_flow(self, first: Tensor | None, mean: Tensor | None) -> list[Tensor]:
+        """F on all faces along each axis, of Q1 = `first` and L0 = `mean`, None for none of it.
+
+        Where there is no light, none enters the box.
+        """
+        outside = None if mean is None else self.outside
+        along_axes = [None] * 3 if first is None else flux_along_axes(first)
+        return [
+            recompute(_find_flow, self.medium, self.diffusion, along, outside, mean, axis)
+            for axis, along in zip(AXES, along_axes, strict=True)
+        ]
 
     def solved(self, solve: SolverWithMemory, right: Tensor) -> Tensor:
         """u of A u = `right`."""
@@ -143,33 +150,10 @@ def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Te
 def _loss_and_source(
     medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What cells lose, and what they gain but for Q1 (E2.4, E2.6, E2.7).
-
-    kappa_a + escape, and kappa_s Q0 + escape L, where escape is the part through the box's faces
-    and L the radiance `outside`.
-    """
+    """What cells lose, and what they gain but for Q1 (E2.4, E2.6, E2.7)."""
     escape = boundary_loss(diffusion, medium.grid, face_resistance(medium.index))
     loss = medium.absorption.value + escape
     return loss, medium.remaining_scattering * source_mean + escape * outside
-
-
-def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
-    """The part along `axis` of div(D kappa_s Q1)."""
-    faces = _find_flow(medium, diffusion, source_flux, None, None, axis)
-    return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
-
-
-def _average_flux(
-    medium: Medium,
-    diffusion: Tensor,
-    source_flux: Tensor | None,
-    outside: Tensor,
-    mean: Tensor,
-    axis: int,
-) -> Tensor:
-    """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
-    faces = _find_flow(medium, diffusion, source_flux, outside, mean, axis)
-    return 3 * face_average(faces, axis)
 
 
 def _find_flow(
@@ -180,7 +164,6 @@ def _find_flow(
     mean: Tensor | None,
     axis: int,
 ) -> Tensor:
-    """F along `axis` on all faces, for Q1 = `source_flux` and L0 = `mean`."""
     scattered = None if source_flux is None else medium.remaining_scattering * source_flux
     resistance = face_resistance(medium.index)
     return face_fluxes(mean, scattered, diffusion, medium.grid, axis, outside, resistance)

@@ -23,7 +23,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import Solution
 from ddrecon.numerics.autodiff import keep, run_plainly
-from ddrecon.numerics.reads import may_read
+from ddrecon.numerics.remember import may_read
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,12 @@
 
 With kappa = 3 D and the corrections of docs/theory.md, section 4, the balance E2.4 reads
 grad kappa . grad L0 + kappa lap L0 - 3 kappa_a L0 + S = 0 with
-S = 3 kappa_s Q0 - div(kappa kappa_s Q1).
+S = 3 kappa_s Q0 - div(kappa kappa_s Q1). The paper names no boundary condition: ghost cells around
+the box hold what Marshak's E2.6 asks for. Energy is not kept, the matrix is not symmetric, and the
+iteration may diverge where kappa changes abruptly: at every surface against empty space.
 
-The paper names no boundary condition; here ghost cells around the box hold what Marshak's E2.6 asks
-for. The scheme neither conserves energy nor has a symmetric matrix, and its iteration may diverge
-where kappa changes abruptly: every surface against empty space.
-
-`make_stencils` has the stencils of the paper's Appendix B. Cells need not be cubes: each axis
-carries its own 1 / h^2 or 1 / (2 h). Sigma5 / h^2 is the first, the sum of neighbors; Sigma3 is
-that minus the diagonal. The other three are gradients: Sigma4 / (4 h^2), grad kappa . grad L0, is
-the product of two, and Sigma7, div Q1, the sum of one. torch takes the derivatives of all, which
-are Sigma1, 2, 6, 8 and 9.
+Of the stencils of Appendix B, Sigma5 / h^2 is the first of `make_stencils`, and Sigma4 and Sigma7
+are made of its three gradients. torch takes the derivatives: Sigma1, 2, 6, 8 and 9.
 """
 
 from __future__ import annotations
@@ -188,5 +183,5 @@ def _divergence_error(operator: PrintedOperator, iteration: int, relative: float
         f"neighbor by a factor above 4; the largest is {float(ratio[z, y, x]):.1f} at cell "
         f"{(x, y, z)}"
     )
-    advice = "raise diffusion.floor or use diffusion.scheme=conservative"
+    advice = "use diffusion.scheme=conservative"
     return SolveError(message, iteration, relative, advice)

@@ -1,44 +1,246 @@
-"""A film driven to its end: its calibration, then frame after frame, and nothing is lost."""
+"""A film: a run's folder for each of its frames, driven one after another, and nothing is lost.
+
+Cameras, exposures and lights do not change in a film: several frames together find them once, in
+the calibration, and `shared.json` keeps them.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import monotonic
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, SolveError
-from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
-from ddrecon.film.report import write_film_report
-from ddrecon.film.shared import SHARED, read_shared, write_shared
-from ddrecon.io.files.folders import RUN, claim_folder
+from ddrecon.errors import (
+    DataWarning,
+    DdreconError,
+    FormatError,
+    SceneError,
+    SolveError,
+    UsageError,
+)
+from ddrecon.grid import Grid
+from ddrecon.io.files.atomic import note_written, write_json
+from ddrecon.io.files.folders import FILM, RUN, Folder, claim_folder
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
+from ddrecon.numerics.flow import carry, find_flow
+from ddrecon.progress import say
 from ddrecon.ranks import own_rank, rank_count
-from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.run.checkpoint import PREVIOUS, fingerprint, newest_checkpoint
-from ddrecon.run.drive import optimize_in_folder
-from ddrecon.run.exported import LENGTHS, fields_to_export
-from ddrecon.run.job import CHECKPOINTS, Checkpoints, Iterations, drive, resume
-from ddrecon.run.loss_log import LossLog
-from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import SCENE, volume_file, write_volume
+from ddrecon.run.job import (
+    CHECKPOINTS,
+    PREVIOUS,
+    Told,
+    fingerprint,
+    has_checkpoint,
+    require_same,
+    work,
+)
+from ddrecon.run.report import list_numbers
+from ddrecon.run.result import RESULT, poses_of, put_values
+from ddrecon.run.run_folder import (
+    LENGTHS,
+    LOG,
+    SCENE,
+    SUMMARY,
+    Iterations,
+    Run,
+    field_key,
+    fields_to_export,
+    read_log,
+    store_value,
+    volume_file,
+    write_scene,
+    write_volume,
+)
+from ddrecon.scene import Scene
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.build_views import remove_pictures
-from ddrecon.scene_file.frames import at_frame
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.build_views import Maker, at_frame, remove_pictures, require_frames
+from ddrecon.scene_file.build_volume import build_media
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    read_described,
+    read_scene,
+    referenced_files,
+)
+from ddrecon.scene_file.view_schema import FramesSection
+from ddrecon.variables.kinds import kind_of
+from ddrecon.variables.values import EVERY
 
-REPORT_SHARE = 0.05
-"""While frames are made, their page takes no more than this part of the time."""
+MIXED = 0.2
+"""The part of a frame's start that is mixed into its result: less noise and less flicker."""
+MOST_APART = 3
+"""Frames farther from each other know nothing of each other's motion."""
+SHARED, SEQUENCE, VELOCITY = "shared.json", "sequence", "velocity"
+"""The file of what frames share, the folder of exported volumes, `film_0000.vdb` and so on, and the
+name of a frame's motion, and of its file."""
+
+
+@dataclass
+class Film:
+    """The film that `scene_file` asks for, in the folder `path`.
+
+    `build` makes the scene of a frame as tensors; `environment` and `preview_every` are as of a
+    run. `shared` is what `shared.json` says.
+    """
+
+    scene_file: SceneFile
+    path: Path
+    build: Callable[[SceneFile], Scene]
+    environment: dict[str, Any] = field(default_factory=dict)
+    preview_every: int | None = None
+    shared: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def frames(self) -> FramesSection:
+        """Which frames there are."""
+        assert self.scene_file.tree.frames is not None
+        return self.scene_file.tree.frames
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The grid of all frames."""
+        media = build_media(Maker(self.scene_file))
+        return next(iter(media.values())).grid
+
+    @property
+    def optimized(self) -> list[str]:
+        """The variables that the film optimizes."""
+        optimize = self.scene_file.tree.optimize
+        return [*optimize.parameters] if optimize else []
+
+    def of(self, number: int) -> Path:
+        """The folder of the run of the frame `number`."""
+        return self.path / "frames" / f"{number:04d}"
+
+    def calibrated(self, number: int) -> Path:
+        """The folder of the volumes that the frame `number` had in the calibration."""
+        return self.path / "calibration" / f"{number:04d}"
+
+    def done(self) -> list[int]:
+        """The frames that are finished."""
+        return [n for n in self.frames.numbers if (self.of(n) / SUMMARY).is_file()]
+
+    def claim(
+        self, path: Path, kind: str, *, overwrite: bool = False, resume: bool = True
+    ) -> AbstractContextManager[Folder]:
+        """A folder of the film, or its own, for one of several processes that do parts of it.
+
+        The others wait, and say so, but for those that are to begin anew.
+        """
+        waiting = say if resume else None
+        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=waiting)
+
+    def scene_of(self, number: int) -> SceneFile:
+        """The scene of the frame `number`, with what is shared fixed.
+
+        Its fields begin as those of a frame close before it, carried on, else as in the
+        calibration, if any. They are written to its folder.
+        """
+        described = describe(at_frame(self.scene_file, number))
+        fix_shared(described, self.shared.get("values", {}), self.path / SHARED)
+        optimize, before = described["optimize"], self._before(number)
+        source = self.calibrated(number) if before is None else self.of(before)
+        fields = fields_in(source, [*optimize["parameters"]])
+        if before is not None and (air := fields_in(source, [VELOCITY])):
+            # The air goes on as it went, and its motion with it.
+            displacement = air[VELOCITY].flip(0) / self._cell * (number - before)
+            displacement = carry(displacement, displacement)
+            fields = {name: carry(value, displacement) for name, value in fields.items()}
+        start = self.of(number).absolute() / "start"
+        for name, value in fields.items():
+            file = start / write_volume(start, name, value, self.grid)
+            optimize["parameters"][name]["init"] = {"file": str(file)}
+        if fields:
+            optimize["keep_start"] = MIXED
+        return read_described(described, self.scene_file.path)
+
+    def write_velocity(self, number: int) -> None:
+        """Writes the motion of the frame `number` from the one before, [u] a frame, for blur.
+
+        The first frame of a part has that of the second.
+        """
+        before, sums = self._before(number), list[Tensor]()
+        if before is None:
+            return
+        for frame in (before, number):
+            fields = fields_in(self.of(frame), self.optimized)
+            moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
+            # Colors are averaged.
+            values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
+            sums.append(torch.stack(values).sum(0))
+        motion = find_flow(*sums) / (number - before) * self._cell
+        for frame in (number, before):
+            with self.claim(self.of(frame), RUN):
+                if not volume_file(self.of(frame), VELOCITY).is_file():
+                    write_volume(self.of(frame), VELOCITY, motion.flip(0), self.grid)
+
+    def _before(self, number: int) -> int | None:
+        """The last frame that is done close before the frame `number`."""
+        far = MOST_APART * self.frames.step
+        return max((n for n in self.done() if 0 < number - n <= far), default=None)
+
+    @property
+    def _cell(self) -> Tensor:
+        """The sides of a cell [u] along z, y and x: [3, 1, 1, 1]."""
+        return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
+
+
+class Calibration(Iterations):
+    """The job of what the frames `numbers` of a `film` share, found from them together."""
+
+    def __init__(self, film: Film, numbers: Sequence[int]):
+        self.film, self.numbers = film, numbers
+        files = [at_frame(film.scene_file, number) for number in numbers]
+        try:
+            scenes = [film.build(scene_file) for scene_file in files]
+            together = Reconstruction(scenes[0], others=scenes[1:])
+            dtype = scenes[0].volume.density.dtype
+            marks = [fingerprint(scene_file, dtype) for scene_file in files]
+        except FormatError as error:
+            advice = (
+                f"frames {', '.join(map(str, numbers))} calibrate the film: change frames.first"
+            )
+            raise FormatError(error.path, f"{error.reason}; {advice} or frames.last") from error
+        named = {f"frame {n}": mark for n, mark in zip(numbers, marks, strict=True)}
+        super().__init__(together, f"calibrate by {len(numbers)} frames", named)
+
+    def begin(self, folder: Folder, is_resumed: bool) -> None:
+        """Nothing is to be made, nor to go."""
+
+    def finish(self) -> Told:
+        """Writes the volumes of these frames and what they share; its checkpoints go."""
+        film, together = self.film, self.run
+        scene, names = together.current_scene(), [p.name for p in together.shared]
+        for number, frame in zip(self.numbers, together.frames, strict=True):
+            for p in frame.parameters:
+                if p.is_field:
+                    grid = frame.problem.scene.volume.grid
+                    write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
+        values = {name: store_value(film.path, scene, name) for name in names}
+        values |= poses_of(scene, names)
+        numbers = list_numbers(together.shared, together.problem.scene, scene)
+        texts = {name: text for name, _, text in numbers}
+        content = {"frames": self.numbers, "values": values, "texts": texts}
+        write_json(film.path / SHARED, content)
+        for file in (film.path / CHECKPOINTS).iterdir():
+            file.unlink()
+        return content, []
 
 
 def optimize_sequence(
@@ -52,44 +254,110 @@ def optimize_sequence(
     """The frames of the film in the scene file at `path`, one after another as they are done.
 
     `folder` keeps it, and a film that was left there goes on; without one nothing is kept.
-    `overrides` (`key.path=value`) are put in first. Raises as `drive_film` does.
+    `overrides` (`key.path=value`) are put in first. Raises as `open_film` and `drive_frames` do.
     """
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         build = partial(build_scene, dtype=dtype, device=device)
         film = Film(read_scene(path, overrides), Path(place), build)
         if film.scene_file.tree.frames is None:
             raise SceneError(f"{path}: frames: missing section; say which, {{first: 0, last: 99}}")
-        numbers = film.frames.numbers
-        with open_film(film, None, numbers, overwrite=False, resume=True):
-            for number in drive_frames(film, numbers):
-                scene = build(read_scene(film.of(number) / RESULT))
-                yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
+        open_film(film, None, overwrite=False, resume=True)
+        for number in drive_frames(film, film.frames.numbers):
+            scene = build(read_scene(film.of(number) / RESULT))
+            yield Result(scene, read_log(film.of(number) / LOG))
 
 
-def drive_film(
-    film: Film, numbers: Sequence[int], exported: str | None, up: str | None = None
-) -> dict[str, Any]:
-    """What `film.json` says of `film` after its frames `numbers`, those that are not yet done.
+def open_film(
+    film: Film,
+    frame_range: str | None,
+    *,
+    overwrite: bool,
+    resume: bool,
+    shared: Path | None = None,
+) -> None:
+    """Prepares the folder of `film` for its frames within `frame_range`.
 
-    All that are done then are `exported` as volumes of this kind, in which the axis `up` points up.
-    Raises as `drive_frames` does.
+    Its calibration may be `shared` from a file. An earlier film's files of these frames are
+    removed, unless this one is to `resume` it. Raises UsageError for a folder that holds something
+    else, or another film, or where another process writes to such a frame; SceneError where
+    pictures are missing, or nothing is optimized.
     """
-    finished, due = film.done(), 0.0
-    try:
-        for number in drive_frames(film, numbers):
-            if number not in finished and monotonic() >= due:
-                start = monotonic()
-                _report(film)
-                due = monotonic() + (monotonic() - start) / REPORT_SHARE
-    finally:
-        record = _report(film)
-    if exported is not None:
-        with film.claim():
-            _export(film, exported, up)
-    return record
+    scene_file, path = film.scene_file, film.path
+    if not any(kind_of(name).is_cellwise for name in film.optimized):
+        text = "optimize.parameters: none changes from frame to frame; name one, such as density"
+        raise SceneError(f"{scene_file.path}: {text}")
+    require_frames(scene_file)
+    calibration = None if shared is None else read_shared(shared)
+    with film.claim(path, FILM, overwrite=overwrite, resume=resume) as folder:
+        chosen, old_scene = choose_frames(film.frames.numbers, frame_range), path / SCENE
+        is_same = (resume or frame_range is not None) and old_scene.is_file()
+        if is_same:
+            old, new = describe(read_scene(old_scene)), describe(scene_file)
+            for scene in (old, new):
+                scene.pop("frames", None)  # a film may grow
+                scene.get("optimize", {}).pop("iterations", None)
+            require_same(old, new, f"{path}: holds another film; use another output folder")
+        write_scene(scene_file, path)
+        if not resume:
+            begun = [f"frames/{number:04d}/" for number in chosen]
+            begun += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
+            inputs = [old_scene, scene_file.path, *referenced_files(scene_file)]
+            inputs += [] if shared is None else [shared]
+            folder.clear(inputs, begun if is_same else [""])
+        if calibration is not None:
+            file = path / SHARED
+            if file.is_file() and read_shared(file)["values"] != calibration["values"]:
+                raise UsageError(f"{file}: holds another calibration; leave --shared out")
+            write_json(file, calibration)
+        for number in film.frames.numbers:
+            note_written(film.of(number), "/")
 
 
-def _export(film: Film, kind: str, up: str | None) -> None:
+def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
+    """Yields the frames `numbers` of `film` as they are finished, after its calibration.
+
+    A frame that fails is named and left out; its error is raised when all others are done.
+    UsageError where another process does one of them.
+    """
+    count, shared = film.frames.calibrate, film.path / SHARED
+    with film.claim(film.path, FILM) as folder:
+        if count and not shared.is_file():
+            job = Calibration(film, spread_out(film.frames.numbers, count))
+            if job.run.shared:
+                is_resumed = has_checkpoint(film.path / CHECKPOINTS)
+                work(job, folder, is_resumed)
+        film.shared = read_shared(shared) if shared.is_file() else {}
+    failures = list[DdreconError]()
+    for number in numbers:
+        try:
+            _drive_frame(film, number)
+        except (SolveError, FormatError, SceneError) as error:
+            failures.append(error)
+            first, *_ = str(error).splitlines()
+            warnings.warn(f"frame {number}, left out: {first}", DataWarning, 2)
+            continue
+        yield number
+    if failures:
+        raise failures[0]
+
+
+def _drive_frame(film: Film, number: int) -> None:
+    """Finishes the frame `number`, from where it was."""
+    path = film.of(number)
+    if number not in film.done():
+        with claim_folder(path, RUN, overwrite=True) as folder:
+            is_resumed = has_checkpoint(path / CHECKPOINTS)
+            scene_file = read_scene(path / SCENE) if is_resumed else film.scene_of(number)
+            scene, title = film.build(scene_file), f"frame {number}"
+            job = Run(scene, scene_file, film.environment, film.preview_every, title)
+            work(job, folder, is_resumed)
+            (path / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
+    if not volume_file(path, VELOCITY).is_file():
+        film.write_velocity(number)
+
+
+def export_film(film: Film, kind: str, up: str | None) -> None:
+    """Writes all frames that are done as volumes of a `kind`, in which the axis `up` points up."""
     (film.path / SEQUENCE).mkdir(exist_ok=True)
     fps, upright = film.frames.fps, film.scene_file.tree.volume.up
     facts: Facts = {"units": f"{LENGTHS}; velocity [u/{'s' if fps else 'frame'}]"}
@@ -111,94 +379,83 @@ def share_out(numbers: Sequence[int]) -> Sequence[int]:
     return numbers[begin:end]
 
 
-def _report(film: Film) -> dict[str, Any]:
-    with film.claim():  # the last of several parts to come knows of all that are done
-        return write_film_report(film)
-
-
-def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
-    """Yields the frames `numbers` of `film` as they are finished.
-
-    A frame that fails is named and left out; its error is raised when all others are done.
-    """
-    with film.claim():
-        calibrate(film)
-    failures = list[DdreconError]()
-    for number in numbers:
-        try:
-            _drive_frame(film, number)
-        except (SolveError, FormatError, SceneError) as error:
-            failures.append(error)
-            first, *_ = str(error).splitlines()
-            warnings.warn(f"frame {number}, left out: {first}", DataWarning, 2)
-            continue
-        yield number
-    if failures:
-        raise failures[0]
-
-
-def calibrate(film: Film) -> None:
-    """Has `film` know what its frames share, by its folder or from several frames together."""
-    path, count = film.path / SHARED, film.frames.calibrate
-    if path.is_file():
-        film.shared = read_shared(path)
-        return
-    if not count:
-        return
-    numbers = spread_out(film.frames.numbers, count)
-    files = [at_frame(film.scene_file, number) for number in numbers]
-    try:
-        scenes = [film.build(scene_file) for scene_file in files]
-        together = Reconstruction(scenes[0], others=scenes[1:])
-        dtype = scenes[0].volume.density.dtype
-    except FormatError as error:
-        advice = f"frames {', '.join(map(str, numbers))} calibrate the film: change frames.first"
-        raise FormatError(error.path, f"{error.reason}; {advice} or frames.last") from error
-    if not together.shared:
-        return
-    described = {
-        f"frame {number}": fingerprint(file, dtype)
-        for number, file in zip(numbers, files, strict=True)
-    }
-    job, saved = Iterations(together), Checkpoints(film.path / "calibration", described)
-    saved.folder.mkdir(parents=True, exist_ok=True)
-    if newest_checkpoint(saved.folder) is not None:
-        resume(job, saved)
-    drive(job, saved, f"calibrate by {len(numbers)} frames", film.is_quiet)
-    for number, frame in zip(numbers, together.frames, strict=True):
-        grid = frame.problem.scene.volume.grid
-        for p in frame.parameters:
-            if p.is_field:
-                write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
-    write_shared(path, together, numbers)
-    for file in saved.folder.iterdir():
-        file.unlink()
-    film.shared = read_shared(path)
-
-
-def _drive_frame(film: Film, number: int) -> None:
-    """Finishes the frame `number`, from where it was."""
-    folder = film.of(number)
-    if number not in film.done():
-        with claim_folder(folder, RUN, overwrite=True) as claimed:
-            is_resumed = newest_checkpoint(folder / CHECKPOINTS) is not None
-            scene_file = read_scene(folder / SCENE) if is_resumed else film.scene_of(number)
-            optimize_in_folder(
-                film.build(scene_file),
-                scene_file,
-                claimed,
-                film.environment,
-                is_resumed=is_resumed,
-                preview_every=film.preview_every,
-                is_quiet=film.is_quiet,
-                frame=f"frame {number}",
-            )
-            (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
-    if not volume_file(folder, VELOCITY).is_file():
-        film.write_velocity(number)
-
-
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
     """`count` of the `numbers`, spread evenly from the first to the last."""
     last = len(numbers) - 1
     return [numbers[round(at)] for at in np.linspace(0, last, min(count, len(numbers)))]
+
+
+def choose_frames(numbers: Sequence[int], frame_range: str | None) -> list[int]:
+    """Those of the frames `numbers` within `frame_range`, `A:B`, both included; None is all.
+
+    Raises UsageError where there are none.
+    """
+    ends = re.fullmatch(r"([0-9]*):([0-9]*)", frame_range or ":")
+    first, last = (ends[1] or 0, ends[2] or numbers[-1]) if ends else (1, 0)
+    chosen = [number for number in numbers if int(first) <= number <= int(last)]
+    if not chosen:
+        film = f"{numbers[0]}:{numbers[-1]}"
+        raise UsageError(f"--frames {frame_range}: names no frame; expected a part of {film}")
+    return chosen
+
+
+def finished_frames(path: Path, frame_range: str | None) -> list[Path]:
+    """The runs of finished frames of the film in the folder `path`, within `frame_range`.
+
+    Raises UsageError where there are none.
+    """
+    finished = (file.parent for file in path.glob(f"frames/*/{SUMMARY}"))
+    runs = {int(run.name): run for run in finished if run.name.isdecimal()}
+    if not runs:
+        raise UsageError(f"{path}: no frame is done")
+    return [runs[number] for number in choose_frames(sorted(runs), frame_range)]
+
+
+def fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
+    """Those of the variables `names` that are fields [..., z, y, x], as the run in `folder` has."""
+    files = {name: volume_file(folder, name) for name in names}
+    read = {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
+    values = {name: torch.from_numpy(field.values) for name, field in read.items()}
+    return {n: v if v.ndim == 3 else v.permute(3, 0, 1, 2).contiguous() for n, v in values.items()}
+
+
+def read_shared(path: Path) -> dict[str, Any]:
+    """What `path`, a `shared.json`, says. Raises UsageError and FormatError."""
+    if not path.is_file():
+        raise UsageError(f"--shared {path}: there is no such file; a film's folder has one")
+    with guard_reading(path):
+        try:
+            content = json.loads(path.read_bytes())
+        except (ValueError, RecursionError) as error:
+            raise FormatError(path, f"not JSON: {error}") from error
+    if not isinstance(content, dict) or not isinstance(content.get("values"), dict):
+        raise FormatError(path, "has no 'values'; expected the shared.json of a film")
+    values = content["values"]
+    for name, value in values.items():
+        if isinstance(value, str):
+            values[name] = str((path.parent / value).absolute())
+    return content
+
+
+def fix_shared(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> None:
+    """Puts the `values`, by variable, that `source` says into the scene `described`.
+
+    They are not optimized any more. Raises UsageError where these are of other cameras or lights.
+    """
+    views = {view["name"]: view for view in described["views"]}
+    lights = (f"lights.{index}" for index in range(len(described["lights"])))
+    owners = {*lights, *(f"views.{name}" for name in views), *({"ground"} & {*described})}
+    for name in values:
+        is_outside = name.startswith(("views.", "lights.", "ground."))
+        if is_outside and name.rpartition(".")[0] not in owners:
+            raise UsageError(f"{source}: {name}: the scene has none; name that of its cameras")
+    train = [name for name, view in views.items() if view["split"] == "train" and "image" in view]
+    for name in [*described["optimize"]["parameters"]]:
+        keys = [name.replace(EVERY, f"views.{view}.") for view in train]
+        names = dict.fromkeys(keys if name.startswith(EVERY) else [name])
+        missing = [key for key in names if key not in values]
+        if missing and len(missing) < len(names):
+            raise UsageError(f"{source}: has no {missing[0]}; name that of the scene's cameras")
+        if not missing:
+            del described["optimize"]["parameters"][name]
+    put_values(described, values)

@@ -43,13 +43,23 @@
 
 namespace ddrecon {
 
-// Adds to a number to which other threads of a GPU may add meanwhile.
-template <class F> INLINE void add_to(F* number, F value) {
-#if defined(__CUDA_ARCH__)
-    atomicAdd(number, value);
+// Numbers to which many items add. Threads of a GPU do so in any order and come to the same bits:
+// they add whole numbers, shares times a scale by which a bound that no sum exceeds is 2^62.
+#if IS_GPU
+template <class F> using Sum = long long;
 #else
-    *number += value;
+template <class F> using Sum = F;
 #endif
+template <class F> INLINE void add_to(Sum<F>* sum, F share) {
+#if defined(__CUDA_ARCH__)
+    atomicAdd((unsigned long long*)sum, (unsigned long long)(long long)share);
+#else
+    *sum += (Sum<F>)share;
+#endif
+}
+template <class F> INLINE F scale_of(double bound) {
+    // What is no number stays so, and that of float does not overflow.
+    return F(0x1p62 / (bound < 0x1p-60 ? 0x1p-60 : bound));
 }
 
 // How numbers are written, and log(2) in two parts, for `decay`; how many terms of series count.
@@ -70,7 +80,7 @@ template <> struct Format<double> {
 };
 
 // How little before a cell's center a place counts as on it, in units of a line's length
-// (`numerics/third_order.py`).
+// (`numerics/interpolation.py`).
 template <class F> constexpr F NEARLY = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
 
 constexpr INLINE double factorial(int n) {

@@ -56,7 +56,6 @@ template <class F> struct Packets {
     static INLINE V read(const F* p) { return *p; }
     static INLINE void write(F* p, V x) { *p = x; }
     static INLINE V gather(const F* p, I at) { return p[at]; }
-    static INLINE void add(F* p, I at, V x) { add_to(p + at, x); }
     static INLINE V log(V x) { return ::log(x); }
     static INLINE V decay(V depth) { return ddrecon::decay(depth); }
 #else
@@ -97,9 +96,6 @@ template <class F> struct Packets {
         V x;
         for (int l = 0; l < LANES; ++l) x[l] = p[at[l]];
         return x;
-    }
-    static INLINE void add(F* p, I at, V x) {
-        for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
     }
     static INLINE V decay(V depth) { return decay_of<F, M>(depth); }
     // log x = n log 2 + log m with x = 2^n m > 0 and m between the root of 1/2 and that of 2:

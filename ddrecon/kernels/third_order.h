@@ -1,6 +1,6 @@
 #pragma once
 #include "ddrecon/kernels/dual.h"
-// Interpolation among four neighbors on a line, to third order (`numerics/third_order.py`): what is
+// Interpolation among four neighbors on a line, to third order (`numerics/interpolation.py`): what is
 // taken off linear interpolation where a field bends.
 
 namespace ddrecon {

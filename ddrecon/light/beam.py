@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
@@ -19,8 +18,9 @@ from ddrecon.medium.coefficients import Medium, along_colors, mean_width
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.decay import Nodes
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.nodes import Nodes
+from ddrecon.numerics.interpolation import resize
 from ddrecon.numerics.remember import remember
 
 MOST_NUMBERS = 1 << 23
@@ -104,9 +104,7 @@ def receive_beams(
 def average_parts(cells: Medium, narrow: Medium, light: Tensor) -> Tensor:
     """`light` [C, z, y, x] of `narrow` cells as `cells` receive it (E5.10)."""
 
-    def pool(field: Tensor) -> Tensor:
-        return adaptive_avg_pool3d(field, cells.grid.shape)
-
+    pool = partial(resize, shape=cells.grid.shape, mode="area")
     field, mean = narrow.extinction.field, pool(light)
     per_field = mean_width(cells.grid) * narrow.extinction.scale
     depth = per_field * pool(field)

@@ -13,11 +13,10 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import EnvironmentLight
-from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.numerics.interpolation import resize, sample_slices
 
 
 def environment_radiance(light: EnvironmentLight, direction: Tensor) -> Tensor:
@@ -62,10 +61,10 @@ def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
     times_across = 2 * math.ceil((columns / width - 1) / 2) + 1
     if times_down > 1:
         size = times_down * (height - 1) + 1, width
-        radiance = interpolate(radiance[None], size, mode="bilinear", align_corners=True)[0]
+        radiance = resize(radiance, size, "linear", align_corners=True)
     if times_across > 1:
         size = len(radiance[0]), times_across * (width + 2)
-        wide = interpolate(_wrap(radiance)[None], size, mode="bilinear")[0]
+        wide = resize(_wrap(radiance), size, "linear")
         radiance = wide[..., times_across:-times_across]
     return radiance
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, pad
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import attenuate_few
@@ -21,7 +21,7 @@ from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
 from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.numerics.interpolation import resize, sample_slices
 from ddrecon.records import bounded
 
 UPWARDS = 24
@@ -78,7 +78,7 @@ class Ground:
         mean = self.mean_albedo[:, None, None]
         if self.albedo.ndim == 1:
             return mean
-        under = adaptive_avg_pool2d(self.albedo, (rows // 2, columns // 2))
+        under = resize(self.albedo, (rows // 2, columns // 2), "area")
         beyond = columns // 4, columns // 4, rows // 4, rows // 4
         return mean + pad(under - mean, beyond)
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.harmonics import count_harmonics, degrees_on, each_harmonic, harmonics
+from ddrecon.numerics.harmonics import count_harmonics, each_harmonic, harmonics
 from ddrecon.numerics.remember import remember
 
 _ROOT = 3**0.5
@@ -81,7 +81,10 @@ def weigh(phi: Tensor, factors: Tensor) -> Tensor:
 
 def by_harmonic(factors: Tensor, degree: int) -> Tensor:
     """`factors` [L + 1, ...] of degrees, of each harmonic up to `degree`, [K, ...]."""
-    return factors.index_select(0, degrees_on(factors.device, degree))
+    # Put together, not indexed: sums on the way back have a fixed order.
+    return torch.cat(
+        [factors[ell].expand(2 * ell + 1, *factors.shape[1:]) for ell in range(degree + 1)]
+    )
 
 
 _harmonics_of = remember(harmonics)

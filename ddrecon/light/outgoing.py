@@ -13,9 +13,9 @@ from ddrecon.light.moments import floored, radiance_along, weigh
 from ddrecon.light.pairs import ReversedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
-from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.series import angle_of, look_up
 
 
 def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:

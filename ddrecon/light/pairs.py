@@ -22,7 +22,7 @@ from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
-from ddrecon.numerics.periods import unroll_along
+from ddrecon.numerics.layout import unroll_along
 
 SMALLEST = 1e-30
 """The least that k^2 is: its root has a slope there, and what is made of it is even in k."""

@@ -24,8 +24,8 @@ from ddrecon.light.moments import beam_moments
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.decay import Nodes
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.numerics.nodes import Nodes
 
 NORM_ORDER = 8
 """Order of the norm that gives a ray's path through a cell: nearly the largest component, without

@@ -25,7 +25,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.periods import Unrolled
+from ddrecon.numerics.layout import Unrolled
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
 

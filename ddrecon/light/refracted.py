@@ -16,7 +16,7 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.profile import POINTS, mean_profile, seen_radius
 from ddrecon.light.sky import Sky
-from ddrecon.medium.fresnel import reflectance, refract
+from ddrecon.medium.optics import reflectance, refract
 from ddrecon.numerics.remember import remember
 
 

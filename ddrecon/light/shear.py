@@ -15,12 +15,9 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused
-from ddrecon.numerics.constants import constant
-from ddrecon.numerics.interpolation import sample_slices
-from ddrecon.numerics.periods import unroll_along
-from ddrecon.numerics.remember import remember
-from ddrecon.numerics.slicing import Slicing, across
-from ddrecon.numerics.third_order import ThirdOrder, nearly
+from ddrecon.numerics.interpolation import ThirdOrder, nearly, sample_slices
+from ddrecon.numerics.layout import Slicing, across, unroll_along
+from ddrecon.numerics.remember import constant, remember
 
 LEAST_SLOPE = 1e-6
 """A smaller slope counts as this: such beams enter through no side of a grid."""

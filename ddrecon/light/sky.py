@@ -16,10 +16,12 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from ddrecon.grid import array_order
 from ddrecon.light.environment import pixel_moments, refine_map, rotate_directions
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PlainLight
+from ddrecon.numerics.autodiff import is_forward
 
 PIXELS_PER_REGION = 2
 """Maps with fewer are refined first. More would smear one bright pixel over several regions."""
@@ -68,11 +70,11 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     radiance = light.scale * light.radiance
     darkest = radiance.detach().amin((1, 2))
     radiance = refine_map(radiance - darkest[:, None, None], rows, 2 * rows)
-    label, regions = _regions(*radiance.shape[1:], light.directions)
+    pixels, regions = _regions(*radiance.shape[1:], light.directions)
 
     # Moments: integrals over each region of radiance times 1, x, y, z, `[N, 4, C]`; `geometry`
     # holds the moments of radiance 1.
-    above_darkest = _integrate(radiance, label, len(regions))
+    above_darkest = _integrate(radiance, pixels)
     geometry = regions.to(above_darkest)[..., None]
     moments = above_darkest + darkest * geometry
 
@@ -102,9 +104,10 @@ def count_suns(light: EnvironmentLight) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=4)
-def _regions(height: int, width: int, directions: int) -> tuple[Tensor, Tensor]:
+def _regions(height: int, width: int, directions: int) -> tuple[tuple[Tensor, ...], Tensor]:
     """The region of each pixel [h * w] of a map of this size, of N around so many `directions`.
 
+    With the pixels one region after another, [h * w], and the place of the first of each there [N].
     And integrals over each region of 1, x, y and z, [N, 4], float64. Empty ones are left out.
     """
     moments = pixel_moments(height, width).reshape(4, -1)
@@ -112,9 +115,10 @@ def _regions(height: int, width: int, directions: int) -> tuple[Tensor, Tensor]:
     axes = fibonacci_sphere(directions)
     chunks = np.array_split(centers, math.ceil(centers.shape[1] / CHUNK_PIXELS), axis=1)
     nearest = np.concatenate([(axes @ chunk).argmax(0) for chunk in chunks])
-    _, label = np.unique(nearest, return_inverse=True)
+    _, label, counts = np.unique(nearest, return_inverse=True, return_counts=True)
+    pixels = label, label.argsort(kind="stable"), counts.cumsum() - counts
     sums = np.stack([np.bincount(label, weights=row) for row in moments], 1)
-    return torch.from_numpy(label), torch.from_numpy(sums)
+    return tuple(map(torch.from_numpy, pixels)), torch.from_numpy(sums)
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
@@ -128,12 +132,22 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     return np.stack([radius * np.sin(angle), y, -radius * np.cos(angle)], 1)
 
 
-def _integrate(radiance: Tensor, label: Tensor, count: int) -> Tensor:
-    """Integrals over every region of the map `radiance` [C, h, w] times 1, x, y, z: `[N, 4, C]`."""
-    values, label = radiance.flatten(1), label.to(radiance.device)
+def _integrate(radiance: Tensor, pixels: Sequence[Tensor]) -> Tensor:
+    """Integrals over every region of the map `radiance` [C, h, w] times 1, x, y, z: `[N, 4, C]`.
+
+    `pixels` are those of `_regions`.
+    """
+    values, device = radiance.flatten(1), radiance.device
+    label, order, first = (numbers.to(device) for numbers in pixels)
     weights = torch.from_numpy(pixel_moments(*radiance.shape[1:])).to(values).flatten(1)
-    blank = values.new_zeros(len(values), count)
-    return torch.stack([blank.index_add(1, label, values * weight).T for weight in weights], 1)
+    terms = (weights[:, None] * values).flatten(0, 1).T
+    if is_forward():
+        is_in = label == torch.arange(len(first), device=device)[:, None]
+        sums = is_in.to(terms) @ terms
+    else:
+        # Many times as fast, but without forward mode.
+        sums = embedding_bag(order, terms, first, mode="sum")
+    return sums.unflatten(1, (len(weights), len(values)))
 
 
 def _are_suns(irradiance: Tensor, regions: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.numerics.periods import FARTHEST
+from ddrecon.numerics.layout import FARTHEST
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class _Table(NamedTuple):
         Kernels sum in a fixed order.
         """
         if is_fused():
-            from ddrecon.march.fused.faces import add_product
+            from ddrecon.kernels.sums import add_product
 
             return add_product(self, values, total)
         products = values.index_select(1, self.columns) * self.weights

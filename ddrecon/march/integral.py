@@ -21,8 +21,7 @@ from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.decay import decayed_sum
-from ddrecon.numerics.nodes import Nodes
+from ddrecon.numerics.decay import Nodes, decayed_sum
 from ddrecon.settings import RenderSettings
 
 CHUNK_NODES = 1 << 18

@@ -19,9 +19,8 @@ from torch.nn.functional import normalize
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, intersect_box
-from ddrecon.numerics.interpolation import sample_slices
-from ddrecon.numerics.slicing import across
-from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.numerics.interpolation import ThirdOrder, sample_slices
+from ddrecon.numerics.layout import across
 
 MARGIN = 2
 """Lattice rays beyond the outermost pixels: as far as interpolation reaches."""

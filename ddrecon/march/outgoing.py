@@ -14,8 +14,8 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient, for_channels
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.periods import Unrolled
-from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.numerics.interpolation import ThirdOrder
+from ddrecon.numerics.layout import Unrolled
 
 
 @dataclass(frozen=True)

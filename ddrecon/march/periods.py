@@ -19,7 +19,7 @@ from ddrecon.march.box import Crossing
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import Sampler, next_node
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.periods import unroll
+from ddrecon.numerics.layout import unroll
 
 HALO = 6
 """Cells around a period that nodes of its rays see: they are cut up to two and a half cells beyond

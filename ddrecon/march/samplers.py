@@ -19,10 +19,9 @@ from ddrecon.march.box import Crossing
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, for_cells
-from ddrecon.numerics.interpolation import sample_slices, sample_volume
+from ddrecon.numerics.interpolation import sample_slices, sample_volume, subdivide
+from ddrecon.numerics.layout import across
 from ddrecon.numerics.remember import remember
-from ddrecon.numerics.slicing import across
-from ddrecon.numerics.third_order import subdivide
 
 STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that

@@ -16,7 +16,7 @@ from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import Sight, look_along, remember_of_camera
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.fresnel import reflectance, refract
+from ddrecon.medium.optics import reflectance, refract
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.settings import RenderSettings

@@ -7,6 +7,7 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, remember_of_phase
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, remember_of_phase
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
@@ -33,7 +34,7 @@ class Volume:
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
     [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function, or g in (-1, 1), the
     mean cosine of Henyey and Greenstein's. Tensors may be replaced or require gradients. `media`:
-    what the volume was mixed from, by name (`mixture`). `support` [z, y, x]: where it is 0 the
+    what the volume was mixed from, by name (`mix_media`). `support` [z, y, x]: where it is 0 the
     volume counts as empty, and derivatives by density are 0; None: it is 1 everywhere.
 
     What glows has an `emission` >= 0, the radiance that a unit of length adds (E2.11), or is as
@@ -372,3 +373,42 @@ def for_channels(values: Tensor, count: int) -> Tensor:
 def mean_width(grid: Grid) -> float:
     """That of a cell by whose optical depth it is thin or thick [u]."""
     return float((sum(width**-2 for width in grid.spacing) / 3) ** -0.5)
+
+
+NEARLY_NONE = 1e-6
+"""So often each medium scatters besides across the box, for a weight where both are empty."""
+
+
+def mix_media(media: Mapping[str, Volume]) -> Volume:
+    """The volume of two `media` on the same grid, of density 1 (E8.10).
+
+    It holds them as `media`. Its phase function is a blend of theirs, which are the same in all
+    cells and no mixtures. What glows, a support and an index are the mixture's own: `replace` it
+    with these. Raises ValueError for another number of media, where grids differ, and for media
+    that have any of these.
+    """
+    if len(media) != 2 or len({medium.grid for medium in media.values()}) != 1:
+        raise ValueError("a mixture is of two media on the same grid")
+    for name, medium in media.items():
+        glows = medium.emission is not None or medium.black_body is not None
+        if glows or medium.support is not None or medium.index != 1:
+            keys = "emission, black_body, support and index"
+            raise ValueError(f"media.{name}: {keys} are for the mixture, not for a medium of it")
+    first, second = media.values()
+    grid = first.grid
+    absorbing = [for_cells(medium.sigma_a) * medium.density for medium in (first, second)]
+    scattering = [for_cells(medium.sigma_s) * medium.density for medium in (first, second)]
+    besides = NEARLY_NONE / math.hypot(*grid.extent)
+    sigma_a, sigma_s = absorbing[0] + absorbing[1], scattering[0] + scattering[1]
+    weight = (scattering[0] + besides) / (sigma_s + 2 * besides)
+    phase = Blend(first.phase, second.phase, weight)
+    colors = max(len(sigma_a), len(sigma_s), phase.colors)
+    sigma_a, sigma_s = (sigma.expand(colors, *grid.shape) for sigma in (sigma_a, sigma_s))
+    return Volume(grid, torch.ones_like(first.density), sigma_a, sigma_s, phase, media=media)
+
+
+def remix(volume: Volume, media: Mapping[str, Volume]) -> Volume:
+    """`volume` of other `media` on its grid; all else, as what glows, is its own."""
+    mixed = mix_media(media)
+    sigma_a, sigma_s = mixed.sigma_a, mixed.sigma_s
+    return replace(volume, sigma_a=sigma_a, sigma_s=sigma_s, phase=mixed.phase, media=media)

@@ -9,12 +9,11 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Cells, Grid
-from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume
-from ddrecon.medium.mixture import remix
-from ddrecon.numerics.periods import Unrolled
+from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume, remix
+from ddrecon.numerics.interpolation import resize
+from ddrecon.numerics.layout import Unrolled
 
 
 def volume_at_level(volume: Volume, grid: Grid, cells: Cells | None = None) -> Volume:
@@ -62,17 +61,12 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
         return field
     if field.dtype == torch.bool:
         return resample(field.float(), grid) > 0
-    colors = field.reshape(1, -1, *shape)
     if shape.numel() > grid.cells:
-        resampled = adaptive_avg_pool3d(colors, grid.shape)
-    else:
-        # Around periodic axes the fewest cells more on both sides that are whole cells of both.
-        before, after = [0, 0, 0], [0, 0, 0]
-        for axis in grid.periodic:
-            common = math.gcd(shape[axis], grid.shape[axis])
-            before[axis], after[axis] = shape[axis] // common, grid.shape[axis] // common
-        wide, around = (Unrolled(grid, tuple(ends), tuple(ends)) for ends in (before, after))
-        size = around.wide.shape
-        resampled = interpolate(wide.extend(colors), size, mode="trilinear", align_corners=False)
-        resampled = around.crop(resampled)
-    return resampled.view(*field.shape[:-3], *grid.shape)
+        return resize(field, grid.shape, "area")
+    # Around periodic axes the fewest cells more on both sides that are whole cells of both.
+    before, after = [0, 0, 0], [0, 0, 0]
+    for axis in grid.periodic:
+        common = math.gcd(shape[axis], grid.shape[axis])
+        before[axis], after[axis] = shape[axis] // common, grid.shape[axis] // common
+    wide, around = (Unrolled(grid, tuple(ends), tuple(ends)) for ends in (before, after))
+    return around.crop(resize(wide.extend(field), around.wide.shape, "linear"))

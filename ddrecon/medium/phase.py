@@ -18,8 +18,15 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.legendre import COUNTS
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.series import (
+    COUNTS,
+    angle_of,
+    gauss_legendre,
+    legendre,
+    look_up,
+    with_slopes,
+)
 
 NEGLIGIBLE = 1e-9
 """Moments below this are left out of series."""
@@ -66,7 +73,7 @@ class PhaseFunction(ABC):
 
     @abstractmethod
     def length(self) -> int:
-        """How many moments are not negligible; one of `numerics.legendre.COUNTS`."""
+        """How many moments are not negligible; one of `numerics.series.COUNTS`."""
 
     @property
     def numbers(self) -> tuple[Tensor, ...]:
@@ -197,3 +204,157 @@ def _powers(g: Tensor, first: int, count: int) -> Tensor:
     base = beside_degrees(g)
     powers: Tensor = base ** degree.view(-1, *[1] * (base.ndim - 2))
     return powers
+
+
+class Mixture(PhaseFunction):
+    """`weight` of the first of two phase functions, and the rest of the second.
+
+    All that it is asked is linear in the weight, which is in [0, 1]: scalar, [3] or of cells.
+    """
+
+    CELLWISE = "weight"
+
+    weight: Tensor
+
+    @property
+    @abstractmethod
+    def parts(self) -> tuple[PhaseFunction, PhaseFunction]:
+        """Both phase functions; no number of theirs differs from cell to cell."""
+
+    def value(self, cosine: Tensor) -> Tensor:
+        first, second = (phase.value(cosine) for phase in self.parts)
+        weight = beside(self.weight, cosine)
+        return weight * first + (1 - weight) * second
+
+    def moments(self, count: int) -> Tensor:
+        return self._mix(*(phase.moments(count) for phase in self.parts))
+
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
+        return self._mix(*(phase.peak_tail(degree, count, sign) for phase in self.parts))
+
+    def length(self) -> int:
+        return max(phase.length() for phase in self.parts)
+
+    def _mix(self, first: Tensor, second: Tensor) -> Tensor:
+        """Moments [C, count] of both phase functions as those of the mixture."""
+        weight = beside_degrees(self.weight)
+        if weight.ndim > 2:
+            first, second = first[..., None, None, None], second[..., None, None, None]
+        return weight * first + (1 - weight) * second
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLobe(Mixture):
+    """`weight` of the first of two Henyey-Greenstein functions, and the rest of the second.
+
+    `g` [2]: their mean cosines; `weight`: in [0, 1], scalar, [3] or of cells.
+    """
+
+    NAME = "two_lobe"
+    VARIABLES = ("g", "weight")
+
+    g: Tensor
+    weight: Tensor
+
+    @property
+    def parts(self) -> tuple[HenyeyGreenstein, HenyeyGreenstein]:
+        return HenyeyGreenstein(self.g[0]), HenyeyGreenstein(self.g[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Blend(Mixture):
+    """`weight` of the phase function `first`, and the rest of `second`: of droplets and air, say.
+
+    Neither is a mixture itself. `weight`: in [0, 1], scalar, [3] or of cells.
+    """
+
+    NAME = "blend"
+
+    first: PhaseFunction
+    second: PhaseFunction
+    weight: Tensor
+
+    @property
+    def parts(self) -> tuple[PhaseFunction, PhaseFunction]:
+        return self.first, self.second
+
+    @property
+    def numbers(self) -> tuple[Tensor, ...]:
+        return *self.first.numbers, *self.second.numbers, self.weight
+
+    @property
+    def kind(self) -> PhaseKind:
+        return _find_kind(type(self.first), type(self.second))
+
+
+@functools.cache
+def _find_kind(first: type[PhaseFunction], second: type[PhaseFunction]) -> PhaseKind:
+    """What makes blends of the numbers of two kinds of phase functions and a weight."""
+    count = len(fields(first))
+
+    def blend(*numbers: Tensor) -> Blend:
+        return Blend(first(*numbers[:count]), second(*numbers[count:-1]), numbers[-1])
+
+    return blend
+
+
+NODES = 2048
+"""Of the quadrature over a table: twice as many as its steps, so that it sees its cubics."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated(PhaseFunction):
+    """A smooth curve through `values` at even angles from 0 to pi, over its integral (E8.2).
+
+    `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale. `at_even_angles` makes them from
+    uneven ones.
+    """
+
+    NAME = "table"
+
+    values: Tensor
+
+    def value(self, cosine: Tensor) -> Tensor:
+        curve = look_up(with_slopes(self.values), angle_of(cosine))[..., 0]
+        return (curve / beside(self.mean, cosine)).clamp(min=0).to(cosine.dtype)
+
+    def moments(self, count: int) -> Tensor:
+        integrals = self._integrals(count)
+        return integrals / integrals[:, :1]
+
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
+        """As many moments as there are of what a forward peak of part f can have.
+
+        f is chi_(degree + 1), but not below 0, and not more than leaves a mean cosine >= 0 to the
+        rest. So a function without a forward peak, as Rayleigh's, has none.
+        """
+        chi = self.moments(degree + count + 1)
+        if sign < 0:
+            return torch.zeros_like(chi[:, :count])
+        peak = torch.minimum(chi[:, degree + 1 : degree + 2], chi[:, 1:2]).clamp(min=0)
+        tail = torch.maximum(torch.minimum(chi[:, degree + 2 :], peak), -peak)
+        return torch.cat([peak, tail], 1)
+
+    def length(self) -> int:
+        large = self.moments(COUNTS[-1]).detach().abs().amax(0) > NEGLIGIBLE
+        last = int(large.nonzero().max()) + 1
+        return next(count for count in COUNTS if last <= count)
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean of the curve over the sphere, [C]."""
+        return self._integrals(1)[:, 0]
+
+    def _integrals(self, count: int) -> Tensor:
+        """Half the integrals over the cosine of the curve times P_l, [C, count]."""
+        angles, weights = _quadrature(count)
+        curve = look_up(with_slopes(self.values), angles.to(self.values.device))[..., 0]
+        return curve @ weights.to(curve)
+
+
+@functools.lru_cache(maxsize=4)
+@torch.inference_mode(False)
+def _quadrature(count: int) -> tuple[Tensor, Tensor]:
+    """Angles of Gauss's rule, and half its weights times P_l there [NODES, count]."""
+    cosine, weights = gauss_legendre(NODES)
+    return cosine.acos(), legendre(cosine, count) * (weights / 2)[:, None]

@@ -26,17 +26,22 @@ from ddrecon.medium.phase import (
     henyey_greenstein,
     remember_of_phase,
 )
-from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
-from ddrecon.numerics.chebyshev import (
+from ddrecon.numerics.decay import decay_mean
+from ddrecon.numerics.series import (
     COEFFICIENTS,
+    STEPS,
+    angle_of,
     depth_at,
     depth_place,
     evaluate,
+    even_angles,
     extrema,
+    legendre_at_even_angles,
+    look_up,
+    series_weights,
     sum_series,
+    with_slopes,
 )
-from ddrecon.numerics.decay import decay_mean
-from ddrecon.numerics.legendre import even_angles, legendre_at_even_angles, series_weights
 
 WEIGHT_POWERS = 4
 """Coefficients over a weight: S of two forward lobes is within about 2 % of E8.7."""
@@ -86,7 +91,7 @@ class SeenPhase:
     def table(self, has_peak: bool) -> Tensor:
         """Of S its coefficients, [C, steps + 1, 2, K], or without a peak of p the values.
 
-        At even angles, with slopes by the angle (`numerics.angle_table`), in double precision. Of a
+        At even angles, with slopes by the angle (`numerics.series`), in double precision. Of a
         phase function that differs from cell to cell K is as `number_table` has it.
         """
         make, degree = (_peak_table, (self.degree,)) if has_peak else (_plain_table, ())

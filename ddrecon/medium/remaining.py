@@ -14,10 +14,8 @@ from ddrecon.medium.phase_peak import (
     peak_moments,
     tabulate_series,
 )
-from ddrecon.numerics.angle_table import look_up
-from ddrecon.numerics.chebyshev import sum_series
-from ddrecon.numerics.legendre import legendre, series_weights
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.numerics.series import legendre, look_up, series_weights, sum_series
 
 
 def remaining_moments(medium: Medium) -> Tensor:

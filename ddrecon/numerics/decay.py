@@ -1,4 +1,6 @@
-"""Exponential decay integrated in closed form over steps on which the optical depth is linear.
+"""Integrals along rays, of what is linear between nodes and of exponential decay there.
+
+Decay is integrated in closed form over steps on which the optical depth is linear.
 
 Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
 
@@ -15,12 +17,13 @@ Where d is small eta is its series: its closed form is a difference of nearly eq
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ddrecon.numerics.autodiff import is_varied
-from ddrecon.numerics.constants import constant
+from ddrecon.numerics.remember import constant
 
 SERIES_BELOW = 0.1
 """Below this depth eta is its series."""
@@ -65,3 +68,30 @@ def _eta(depth: Tensor, phi: Tensor) -> Tensor:
         series = torch.addcmul(factor, depth, series, value=-1)
     thick = depth.clamp(min=SERIES_BELOW)
     return torch.where(depth < SERIES_BELOW, series, ((1 - phi) / thick - 0.5 * phi) / thick)
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """N nodes on each of R rays.
+
+    `origin` and unit `direction` [R, 3] of the rays, in array order; `distance` [N, R]: from the
+    origin to the nodes [u].
+    """
+
+    origin: Tensor
+    direction: Tensor
+    distance: Tensor
+
+    @property
+    def lengths(self) -> Tensor:
+        """The lengths [u] of the segments between nodes, `[N - 1, R]`."""
+        return self.distance[1:] - self.distance[:-1]
+
+    def integral(self, values: Tensor, measure: Tensor | None = None) -> Tensor:
+        """The integral `[N - 1, K, R]` over each segment of what is linear between nodes.
+
+        `values`: [N, K, R] at the nodes; `measure` [N - 1, R]: of each segment, by default its
+        length.
+        """
+        over = self.lengths if measure is None else measure
+        return 0.5 * (values[:-1] + values[1:]) * over[:, None]

@@ -7,7 +7,6 @@ with Legendre's polynomials P_l. For l = 1 they are sqrt(3) times y, z and x.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator
 
@@ -60,14 +59,3 @@ def norm(ell: int, m: int) -> float:
     """What makes the mean square of a harmonic 1."""
     orders = 2 if m else 1
     return math.sqrt(orders * (2 * ell + 1) * math.factorial(ell - m) / math.factorial(ell + m))
-
-
-@functools.cache
-@torch.inference_mode(False)
-def degrees_on(device: torch.device, degree: int) -> Tensor:
-    """The degree l of each harmonic up to `degree`, by k.
-
-    On `device`, made once: for a copy a GPU would be waited for.
-    """
-    degrees = [ell for ell in range(degree + 1) for _ in range(2 * ell + 1)]
-    return torch.tensor(degrees, device=device)

@@ -7,7 +7,8 @@ number that Python reads a processor waits for a GPU.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 from weakref import WeakValueDictionary, ref
 
@@ -126,3 +127,33 @@ def forget_changed() -> None:
 def is_any_nonzero(tensor: Tensor) -> bool:
     """Whether one of the numbers of `tensor` is not 0."""
     return bool((tensor != 0).any())
+
+
+def constant(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """`numbers` as a tensor [N] of the type and on the device of `like`; nobody may change it."""
+    return _write(tuple(numbers), like.dtype, like.device)
+
+
+@functools.lru_cache(maxsize=4096)
+def _write(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, dtype=dtype, device=device)
+
+
+_may_read = True
+
+
+def may_read() -> bool:
+    """Whether a computation may depend on numbers that it reads."""
+    return _may_read
+
+
+@contextmanager
+def without_reads() -> Iterator[None]:
+    """Within it nothing is read: solves make as many iterations as they are told."""
+    global _may_read
+    _may_read = False
+    try:
+        yield
+    finally:
+        _may_read = True

@@ -1,4 +1,4 @@
-"""The scales on which pictures are compared: linear radiance, displayed values, stabilized ones."""
+"""The scales on which pictures are compared, and how alike they are in structure."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, conv2d, pad
 
 from ddrecon.pictures.noise import Noise, estimate_noise
 from ddrecon.pictures.srgb import display, display_slope
 
-NODES = 1025
+SIDE = 32
+NODES = SIDE**2 + 1
 """Places between which the stabilized scale is interpolated, close together near black."""
-
-
+RADIUS, DEVIATION = 5, 1.5
+"""The Gaussian window, in pixels: 11 x 11."""
+K1, K2 = 0.01, 0.03
+"""Parts of the peak that keep quotients finite in flat places."""
 LINEAR = "linear radiance"
 COMPARED = {"display": "displayed values (sRGB)", "photon": "radiance in units of its noise"}
 """What losses compare, in words, where that is not linear radiance."""
@@ -61,7 +64,12 @@ class Stabilized(Scale):
         top = radiance.max().clamp(min=torch.finfo(radiance.dtype).tiny).double()
         places = top * torch.linspace(0, 1, NODES, dtype=torch.float64, device=top.device) ** 2
         slopes = 1 / self.noise.deviation(places)
-        heights = torch.cat([places[:1], torch.cumulative_trapezoid(slopes, places)])
+        # Summed up to each node by rows: on a GPU `cumsum` has no fixed order.
+        areas = ((slopes[1:] + slopes[:-1]) / 2 * places.diff()).view(SIDE, SIDE)
+        ones = torch.ones_like(areas)
+        rows = areas @ ones.triu()
+        sums = rows + ones.tril(-1) @ rows[:, -1:]
+        heights = torch.cat([places[:1], sums.flatten()])
         at = ((radiance / top).clamp(min=0).sqrt() * (NODES - 1)).clamp(max=NODES - 1)
         below = at.long().clamp(max=NODES - 2)
         fraction = (radiance - places[below]) / (places[below + 1] - places[below])
@@ -79,3 +87,33 @@ def scale_of(loss: str, image: Tensor, noise: Noise | None) -> Scale:
     if loss == "photon":
         return Stabilized(noise=noise or estimate_noise(image, 0.0))
     return Displayed() if loss == "display" else Scale()
+
+
+def structural_similarity(
+    image: Tensor, reference: Tensor, peak: Tensor, seen: Tensor | None = None
+) -> Tensor:
+    """The structural similarity [c, h, w] of two images [c, h, w] whose largest value is `peak`.
+
+    Wang et al. 2004, doi:10.1109/TIP.2003.819861, with their window. At an edge it is cut off, and
+    where `seen` [h, w] is 0.
+    """
+    place = torch.arange(-RADIUS, RADIUS + 1).to(image)
+    window = torch.exp(-0.5 * (place / DEVIATION) ** 2)
+
+    def blur(values: Tensor) -> Tensor:
+        padded = pad(values[:, None], (RADIUS,) * 4)
+        return conv2d(conv2d(padded, window.view(1, 1, -1, 1)), window.view(1, 1, 1, -1))[:, 0]
+
+    seen = torch.ones_like(image[0]) if seen is None else seen
+    weight = blur(seen[None]).clamp(min=torch.finfo(seen.dtype).tiny)
+
+    def mean(values: Tensor) -> Tensor:
+        return blur(values * seen) / weight
+
+    first, second = mean(image), mean(reference)
+    contrast = mean(image * image) - first**2 + mean(reference * reference) - second**2
+    structure = mean(image * reference) - first * second
+    low, high = (K1 * peak) ** 2, (K2 * peak) ** 2
+    return ((2 * first * second + low) * (2 * structure + high)) / (
+        (first**2 + second**2 + low) * (contrast + high)
+    )

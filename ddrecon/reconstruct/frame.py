@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +16,6 @@ from ddrecon.errors import SolveError
 from ddrecon.pictures.noise import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
-from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.metric import find_diagonals
 from ddrecon.reconstruct.numbers import Point
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
@@ -27,8 +27,57 @@ from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
 
+
+@dataclass(frozen=True)
+class Row:
+    """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
+
+    `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
+    `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
+    views are None where none was rendered, and SSIMs where they were not looked at.
+    """
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr: float
+    test_psnr: float | None
+    forward_iterations: int
+    adjoint_iterations: int
+    cells: int
+    data_loss: float
+    penalty: float
+    ssim: float | None = None
+    test_ssim: float | None = None
+
+    def after(self, total: Row, is_accepted: bool) -> Row:
+        """The running totals of the log with this row: sums, and quality as last known.
+
+        Of a candidate that was refused, its quality does not count.
+        """
+        stale = () if is_accepted else OF_CANDIDATE
+        known = {
+            name: getattr(total, name)
+            for name, value in vars(self).items()
+            if value is None or name in stale
+        }
+        counts = "forward_iterations", "adjoint_iterations"
+        sums = {name: getattr(total, name) + getattr(self, name) for name in counts}
+        return replace(self, **known, **sums)
+
+
 OF_CANDIDATE = ("loss", "data_loss", "penalty", "psnr", "ssim")
 """What a row says of a candidate, which may be refused."""
+NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
+"""The sum of no rows."""
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
+
+    scene: Scene
+    rows: list[Row]
 
 
 @dataclass(frozen=True)
@@ -63,25 +112,28 @@ class Frame:
         # These belong to another resolution.
         self.memory.last, self.memory.iterations = {}, {}
         self.replays = Replays(self.level.train)
-        for parameter in self.parameters:
-            if parameter.grid != volume.grid:
-                parameter.refine(volume.grid)
-            if volume.support is not None and parameter.name in ("density", "emission"):
-                parameter.restrict(volume.support)
+        for p in self.parameters:
+            if p.grid != volume.grid:
+                p.refine(volume.grid)
+            if volume.support is not None and p.name in ("density", "emission"):
+                p.restrict(volume.support)
 
     def evaluate(self) -> Evaluation:
         """The objective at the values of the parameters.
 
         Raises SolveError and NotFiniteError.
         """
-        values = {p.name: p.value for p in self.parameters}
-        compared = Comparison(self.level.train.views, self.level.targets)
-        unit = self.problem.power or 1.0
-        differentiated = self._differentiate(values, compared)
-        penalties = {p.name: p.penalty() for p in self.parameters}
-        priors = {name: pair for name, pair in penalties.items() if pair is not None}
-        penalty = sum((value for value, _ in priors.values()), differentiated.loss.new_zeros(()))
-        of_images, prior, psnr = compared.read(differentiated, penalty, self.parameters)
+        compared, unit = Comparison(self.level.train.views, self.level.targets), self.problem.unit
+        numbers = None
+        while numbers is None:
+            differentiated = self._differentiate(compared)
+            priors = {p.name: pair for p in self.parameters if (pair := p.penalty()) is not None}
+            terms = (value for value, _ in priors.values())
+            penalty = sum(terms, differentiated.loss.new_zeros(()))
+            numbers = compared.read(differentiated, penalty, self.parameters)
+            if numbers is None:
+                self.replays.forget(compared, self.memory)
+        of_images, prior, psnr = numbers
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
         bars = {name: bar for name, (_, bar) in priors.items()}
@@ -89,11 +141,11 @@ class Frame:
 
     def noise_loss(self) -> float:
         """The loss of perfect images: that of the pictures' noise and of the model's own error."""
-        train, settings, total = self.level.train, self.problem.settings, 0.0
+        train, total = self.level.train, 0.0
         weights = sum(view.weight for view in train.views)
         for view in train.views:
             image, target = target_of(view), self.level.targets[view.name]
-            known = given_noise(view, settings)
+            known = given_noise(view, self.problem.settings)
             noise = known or estimate_noise(image, view.step)
             # A mean of pixels has less noise than each, which estimates see.
             whole = target_of(self.problem.train.view(view.name))
@@ -101,29 +153,27 @@ class Frame:
             square = share * noise.deviation(image) ** 2 + (tuning.MODEL_ERROR * image) ** 2
             loss = (target.weights_at(image) * square).sum() / 2
             total += view.weight / weights * float(loss)
-        return total / (self.problem.power or 1.0)
+        return total / self.problem.unit
 
     def find_diagonals(
         self, parameters: Sequence[Parameter], compared: Comparison
     ) -> dict[str, Tensor]:
         """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
-        point = self.point(compared)
+        point, memory = self.point(compared), self.memory
         # Random pictures need no exact light, and their adjoint is near to no other.
-        memory = SolveMemory(
-            self.memory.is_warm,
-            dict(self.memory.last),
-            self.memory.records,
-            solve_tolerances(1.0),
+        inexact = SolveMemory(
+            memory.is_warm, dict(memory.last), memory.records, solve_tolerances(1.0)
         )
-        return find_diagonals(point.scene, parameters, point.values, point.weights, memory)
+        return find_diagonals(point.scene, parameters, point.values, point.weights, inexact)
 
     def point(self, compared: Comparison) -> Point:
         """Where the parameters stand, with how strongly the pixels `compared` count."""
         values = {p.name: p.value.detach() for p in self.parameters}
-        views, unit = {view.name: view for view in compared.views}, self.problem.power or 1.0
         weights = {
-            name: compared.targets[name].weights_at(image) * (compared.share(views[name]) / unit)
-            for name, image in compared.pictures.items()
+            view.name: compared.targets[view.name].weights_at(compared.pictures[view.name])
+            * (compared.share(view) / self.problem.unit)
+            for view in compared.views
+            if view.name in compared.pictures
         }
         return Point(self.level.train, values, weights, self.memory.last)
 
@@ -139,70 +189,65 @@ class Frame:
 
         The running totals keep the losses of the last candidate that the search accepted.
         """
-        solves = [(record.kind, record.iterations) for record in self.memory.records]
-        test_psnr, test_ssim, ssim = None, None, None
+        objective, unit, counts = evaluation.objective, self.problem.unit, Counter[str]()
+        for record in self.memory.records:
+            counts[record.kind] += record.iterations
+        quality = dict[str, float]()
         if is_test_due:
-            ssim = evaluation.compared.similarity()
-            if self.level.test.views:
-                test_psnr, test_ssim = render_quality(
-                    self.level.test, self.parameters, self.level.test_targets, self.memory
-                )
-        unit = self.problem.power or 1.0
+            quality["ssim"] = evaluation.compared.similarity()
+        if is_test_due and self.level.test.views:
+            quality["test_psnr"], quality["test_ssim"] = render_quality(
+                self.level.test, self.parameters, self.level.test_targets, self.memory
+            )
         row = Row(
             iteration=self.total.iteration + 1,
             seconds=self.total.seconds + seconds,
-            loss=evaluation.objective.total(weight) * unit,
-            data_loss=evaluation.objective.loss * unit,
-            penalty=evaluation.objective.prior * weight * unit,
+            loss=objective.total(weight) * unit,
+            data_loss=objective.loss * unit,
+            penalty=objective.prior * weight * unit,
             psnr=evaluation.psnr,
-            test_psnr=test_psnr,
-            forward_iterations=sum(count for kind, count in solves if kind == "forward"),
-            adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
+            forward_iterations=counts["forward"],
+            adjoint_iterations=counts["adjoint"],
             cells=self.level.train.volume.grid.cells,
-            ssim=ssim,
-            test_ssim=test_ssim,
+            **({"test_psnr": None} | quality),
         )
-        # Sum: the solvers' iterations, and quality as last known.
-        stale = () if is_accepted else OF_CANDIDATE
-        unchanged = {
-            name: getattr(self.total, name)
-            for name, value in vars(row).items()
-            if value is None or name in stale
-        }
-        counts = "forward_iterations", "adjoint_iterations"
-        sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
-        self.total = replace(row, **unchanged, **sums)
+        self.total = row.after(self.total, is_accepted)
         return row
 
     def current_scene(self) -> Scene:
         """The scene at full resolution, with everything as reconstructed so far."""
         grid = self.problem.scene.volume.grid
         with torch.no_grad():
-            values = {parameter.name: parameter.value_on(grid) for parameter in self.parameters}
-            return with_values(self.problem.scene, values)
+            return with_values(
+                self.problem.scene, {p.name: p.value_on(grid) for p in self.parameters}
+            )
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         return {
-            "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
+            "parameters": {p.name: p.state() for p in self.parameters},
             "total": dict(vars(self.total)),
             "solutions": dict(self.memory.last),
+            "iterations": dict(self.memory.iterations),
             "misfit": self.misfit,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up the parameters and the log of `state`."""
-        for parameter in self.parameters:
-            parameter.restore(state["parameters"][parameter.name])
+        for p in self.parameters:
+            p.restore(state["parameters"][p.name])
         self.total, self.misfit = Row(**state["total"]), state["misfit"]
 
     def restore_solutions(self, state: Mapping[str, Any]) -> None:
         """Takes up what solves begin from, at the resolution of `state`."""
-        for kind, solution in state["solutions"].items():
-            self.memory.last[kind] = solution.to(self.problem.scene.volume.density)
+        like = self.problem.scene.volume.density
+        self.memory.last |= {kind: u.to(like) for kind, u in state["solutions"].items()}
+        # By which iterations are recorded on a GPU.
+        self.memory.iterations = dict(state["iterations"])
 
-    def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:
+    def _differentiate(self, compared: Comparison) -> Differentiated:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
+        values = {p.name: p.value for p in self.parameters}
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
         try:

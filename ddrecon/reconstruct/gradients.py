@@ -7,6 +7,7 @@ not grow with the number of views, and the adjoint (E3.2) is solved once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
@@ -18,8 +19,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
+from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.shares import agree_on, own_views, sum_present
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
@@ -27,11 +28,15 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Differentiated:
-    """The `loss` of all views, its derivatives by name, and `images` [3, h, w] of this rank's."""
+    """The `loss` of all views, its derivatives by name, and `images` [3, h, w] of this rank's.
+
+    They are worth nothing where a relative residual, one of `residuals`, exceeds its limit.
+    """
 
     images: list[Tensor]
     loss: Tensor
     gradients: dict[str, Tensor]
+    residuals: Sequence[tuple[Tensor, float]] = ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ def differentiate(
     del cut, inputs, sums
     through_light = follow_back(tensors, leaf_bars, list(values.values()))
     # The derivative is the sum of both ways.
-    direct = _add(direct, through_light)
+    _accumulate(direct, through_light, set())
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -168,14 +173,6 @@ def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added:
             added.add(i)
 
 
-def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Entry by entry; None is zero."""
-    return [
-        total if addend is None else addend if total is None else total + addend
-        for total, addend in zip(sums, more, strict=True)
-    ]
-
-
 def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
     """`record` with leaves in place of tensors that have a graph; both are added to the lists.
 
@@ -206,3 +203,39 @@ def solve_tolerances(misfit: float) -> dict[str, float]:
     the gradient's, whatever the misfit. `misfit` >= 0 is that of the last images compared.
     """
     return {"forward": tuning.GRADIENT_ERROR * min(misfit, 1.0), "adjoint": tuning.GRADIENT_ERROR}
+
+
+def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
+    """The views of `scene` called `names` that this rank renders, in their order.
+
+    One that is named twice is rendered twice, by the same rank.
+    """
+    pixels = {name: math.prod(scene.view(name).camera.size) for name in names}
+    # Ranks take turns, largest views first, so that all end at about one time.
+    rank_names = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
+    return [name for name in names if name in rank_names]
+
+
+def sum_present(tensors: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
+    """The sums of `tensors` over ranks; None is zero, and stays where all ranks have it.
+
+    `likes` have the shapes of `tensors`.
+    """
+    is_found = [count > 0 for count in sum_numbers([tensor is not None for tensor in tensors])]
+    chosen = [
+        torch.zeros_like(like) if tensor is None else tensor
+        for tensor, like, is_any in zip(tensors, likes, is_found, strict=True)
+        if is_any
+    ]
+    sums = iter(sum_over_ranks(chosen))
+    return [next(sums) if is_any else None for is_any in is_found]
+
+
+def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The first rank's `gradients` by name.
+
+    Those of others are the same, unless a GPU or another kind of processor adds in another order:
+    then they differ by rounding, by which a search may decide otherwise.
+    """
+    ours = [gradient if is_first() else 0 * gradient for gradient in gradients.values()]
+    return dict(zip(gradients, sum_over_ranks(ours), strict=True))

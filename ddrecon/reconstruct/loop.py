@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -19,11 +20,10 @@ from ddrecon.errors import RanksError, SolveError
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
-from ddrecon.reconstruct.frame import Evaluation, Frame
-from ddrecon.reconstruct.log import Result, Row
-from ddrecon.reconstruct.metric import FieldMetric
+from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
+from ddrecon.reconstruct.metric import invert_metric
 from ddrecon.reconstruct.numbers import Numbers
+from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
 from ddrecon.reconstruct.search import Inverse, Objective, Search, Space, Values
@@ -109,7 +109,7 @@ class Reconstruction:
         weight = self.search.weight
         is_accepted = self.search.judge(candidate, objective)
         self._put(self.search.values)
-        stage = self.schedule.stage
+        stage, number = self.schedule.stage, self.schedule.progress.stage
         self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
         is_over = self.schedule.is_over(self.iteration + 1)
         fraction = self.problem.settings.keep_start
@@ -124,8 +124,10 @@ class Reconstruction:
             frame.add_row(evaluation, weight, seconds, is_accepted, is_test_due)
             for frame, evaluation in zip(self.frames, evaluations, strict=True)
         ]
-        if self.schedule.stage != stage:
+        if self.schedule.progress.stage != number:
             self._pass_trial(is_over=stage.is_trial)
+            if stage.is_trial or self.schedule.stage.level == stage.level:
+                self.search.pairs = []  # the metric of what is there finds other directions
             self._enter_stage()
         return rows
 
@@ -153,8 +155,8 @@ class Reconstruction:
 
         Both are parts of that of the pictures, as the loss compares them.
         """
-        unit = self.problem.power or 1.0
-        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
+        residual = math.sqrt(self.total.data_loss / self.problem.unit)
+        noise = math.sqrt(self.noise_loss)
         ending: dict[str, Any] = self.schedule.ending(self.iteration)
         ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
         return ending | {"residual": residual, "noise": noise}
@@ -171,7 +173,7 @@ class Reconstruction:
             "search": self.search.state(),
             "rival": self.rival,
             "diagonals": self.diagonals,
-            "numbers": self.numbers.state(),
+            "numbers": (self.numbers.matrix, self.numbers.prior),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -187,7 +189,7 @@ class Reconstruction:
         self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
         loss, values = state["rival"]
         self.rival = loss, {key: value.to(like[key]) for key, value in values.items()}
-        self.numbers.restore(state["numbers"])
+        self.numbers.matrix, self.numbers.prior = state["numbers"]
 
     def _pass_trial(self, is_over: bool) -> None:
         """Begins a trial of denser fields where one is due; ends one that `is_over`."""
@@ -207,9 +209,14 @@ class Reconstruction:
         """Takes frames to the resolution of the stage; the search begins anew."""
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
-        # How long the metric is hardly changes with resolution.
         self.diagonals = {}
-        self.search = Search(self.space, scales=self.search.scales, weight=self.search.weight)
+        # How the objective bends, and how long the metric is, hardly changes with resolution.
+        pairs = [
+            (self._carry(move), self._carry(of_loss, True), self._carry(of_prior, True))
+            for move, of_loss, of_prior in self.search.pairs
+        ]
+        scales, weight = self.search.scales, self.search.weight
+        self.search = Search(self.space, scales=scales, weight=weight, pairs=pairs)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
     def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
@@ -217,7 +224,7 @@ class Reconstruction:
         before = self.search.state()
         while True:
             is_first = not self.search.values
-            candidate = self._project(self._values()) if is_first else self.search.candidate()
+            candidate = self._project(self._values()) if is_first else self.search.candidate
             self._put(candidate)
             try:
                 return candidate, [frame.evaluate() for frame in self.frames]
@@ -283,16 +290,20 @@ class Reconstruction:
 
     def _metric(self, values: Values, free: Values) -> Inverse:
         """The inverse metric at `values`, of what is `free`."""
-        waiting, weight, metrics = self.schedule.stage.waiting, self.search.weight, {}
-        for key, p in self.blocks.items():
+        waiting, weight = self.schedule.stage.waiting, self.search.weight
+        inverses = dict[str, Callable[[Tensor], Tensor]]()
+        for key, diagonal in self.diagonals.items():
+            p, is_free = self.blocks[key], free[key]
             if p.tv and p.name not in waiting:
-                metrics[key] = FieldMetric(p, values[key], self.diagonals[key], weight, free[key])
+                inverses[key] = invert_metric(p, values[key], diagonal, weight, is_free)
+            else:
+                inverses[key] = partial(torch.mul, is_free / diagonal)
 
         def precondition(vectors: Sequence[Values]) -> list[Values]:
-            fields = dict[str, Tensor]()
-            for key, diagonal in self.diagonals.items():
-                bars, metric = torch.stack([vector[key] for vector in vectors]), metrics.get(key)
-                fields[key] = metric.solve(bars) if metric else bars * free[key] / diagonal
+            fields = {
+                key: invert(torch.stack([vector[key] for vector in vectors]))
+                for key, invert in inverses.items()
+            }
             return [
                 {key: bars[n] for key, bars in fields.items()}
                 | self.numbers.precondition(vector, free)
@@ -308,7 +319,36 @@ class Reconstruction:
         for key, p in self.blocks.items():
             p.value = values[key].detach().requires_grad_()
 
+    def _carry(self, vector: Values, is_slope: bool = False) -> Values:
+        """Moves, or derivatives, carried to the resolution of the parameters."""
+        return {key: self.blocks[key].carry(entry, is_slope) for key, entry in vector.items()}
+
     def _key(self, frame: Frame, p: Parameter) -> str:
         """The search's name of a parameter of `frame`: fields are each frame's own."""
         is_shared = len(self.frames) == 1 or not p.is_field
         return p.name if is_shared else f"frame {self.frames.index(frame)} {p.name}"
+
+
+BEGUN = 2
+"""Iterations after which there is a medium, and kernels are compiled."""
+
+
+def time_iteration(scene: Scene) -> float:
+    """About how many seconds an iteration at the full resolution of `scene` takes.
+
+    Cells and samples of view rays alike grow with the cells, so the time of an iteration is a line
+    through those at the two coarsest levels of resolution. Raises DdreconError as a run does.
+    """
+    run, points = Reconstruction(scene), list[tuple[int, float]]()
+    for _ in range(BEGUN):
+        run.step()
+    frame, levels = run.frames[0], len(run.problem.factors)
+    for level in range(levels)[:2]:
+        frame.enter(level)
+        frame.evaluate()  # what is prepared once
+        start = perf_counter()
+        frame.evaluate()
+        points.append((frame.level.train.volume.grid.cells, perf_counter() - start))
+    (fewer, less), (more, longer) = points[0], points[-1]
+    rate = max(longer - less, 0.0) / (more - fewer) if more > fewer else 0.0
+    return longer + rate * (scene.volume.grid.cells - more)

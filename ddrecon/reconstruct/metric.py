@@ -8,7 +8,7 @@ a cloud comes before its crust. Of single numbers it is the whole matrix between
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -19,8 +19,7 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import face_stiffness
+from ddrecon.reconstruct.parameters import Parameter, face_stiffness
 from ddrecon.scene import Scene, View
 
 
@@ -62,38 +61,36 @@ def _smooth(squares: Tensor, count: int) -> Tensor:
     return unit * (mean / unit).clamp(min=tuning.FLOOR) ** tuning.POWER
 
 
-class FieldMetric:
-    """The metric of a field at `value`, of its entries that are `free`; its prior has a `weight`.
+def invert_metric(
+    parameter: Parameter, value: Tensor, diagonal: Tensor, weight: float, free: Tensor
+) -> Callable[[Tensor], Tensor]:
+    """The inverse metric of a field at `value`, of entries that are `free`, its prior by `weight`.
 
     With H the `diagonal` of the pictures' Gauss-Newton matrix it is H + S D^T V D S (E11.2), and so
     S (H / S^2 + D^T V D) S, the inside of which is an operator as that of diffusion. What is not
-    free is held by a loss.
+    free is held by a loss. It takes several residuals [N, ..., z, y, x] at once.
     """
+    grid, unit = parameter.grid, parameter.unit
+    factor = weight * parameter.tv / unit**2
+    faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
+    slope = torch.ones_like(value) if slope is None else slope
+    scale = free / slope
+    z, y, x = map(_with_colors, faces)
+    held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)
+    loss = _with_colors(diagonal / slope**2 + held)
+    periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
+    operator = Operator((z, y, x), loss, periodic, grid.spacing)
 
-    def __init__(
-        self, parameter: Parameter, value: Tensor, diagonal: Tensor, weight: float, free: Tensor
-    ):
-        grid, unit = parameter.grid, parameter.unit
-        factor = weight * parameter.tv / unit**2
-        faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
-        slope = torch.ones_like(value) if slope is None else slope
-        self._scale = free / slope
-        z, y, x = map(_with_colors, faces)
-        held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)
-        loss = _with_colors(diagonal / slope**2 + held)
-        periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
-        self._operator = Operator((z, y, x), loss, periodic, grid.spacing)
-
-    def solve(self, residuals: Tensor) -> Tensor:
-        """The inverse metric times several `residuals` [N, ..., z, y, x], of what is free."""
-        right, colors = _with_colors(residuals * self._scale), len(self._operator.loss)
+    def solve(residuals: Tensor) -> Tensor:
+        right = _with_colors(residuals * scale)
         # Fields of one color are as colors of one field.
-        fields = right.split(colors) if colors > 1 else [right]
+        fields = right.split(len(loss)) if len(loss) > 1 else [right]
         solutions = [
-            solve_by_multigrid(self._operator, field, None, 0.0, tuning.CYCLES).value
-            for field in fields
+            solve_by_multigrid(operator, field, None, 0.0, tuning.CYCLES).value for field in fields
         ]
-        return torch.cat(solutions).view_as(residuals) * self._scale
+        return torch.cat(solutions).view_as(residuals) * scale
+
+    return solve
 
 
 def _with_colors(field: Tensor) -> Tensor:

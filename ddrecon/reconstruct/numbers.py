@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,8 +25,8 @@ from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import own_views
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, kind_of
 from ddrecon.variables.values import with_values
@@ -87,14 +86,6 @@ class Numbers:
         # As the first rank has it: another machine may round in another way.
         self.matrix, self.prior = from_first(matrix + prior), from_first(prior)
 
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
-        return {"matrix": self.matrix, "prior": self.prior}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up a `state`."""
-        self.matrix, self.prior = state["matrix"], state["prior"]
-
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
         """What calibrations add to the objective at `values`, and its derivatives by name."""
         if not self.precisions:
@@ -112,8 +103,7 @@ class Numbers:
         at = self._join(free).nonzero()[:, 0]
         result = torch.zeros(len(self.matrix)).double()
         if len(at):
-            solution = self._solve(self.matrix, self._join(residual)[at], at)
-            result[at] = from_first(solution)
+            result[at] = from_first(self._solve(self._join(residual)[at], at))
         return self._split(result, residual)
 
     def hold_gauges(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -123,9 +113,9 @@ class Numbers:
             held |= gauge.hold(held)
         return held
 
-    def _solve(self, matrix: Tensor, right: Tensor, at: Tensor) -> Tensor:
-        """The solution of the rows and columns `at` of `matrix`, within the gauges."""
-        matrix = matrix[at[:, None], at]
+    def _solve(self, right: Tensor, at: Tensor) -> Tensor:
+        """The solution of the rows and columns `at` of the matrix, within the gauges."""
+        matrix = self.matrix[at[:, None], at]
         least = torch.zeros(len(self.matrix)).double()
         for place in self.places.values():
             diagonal = self.matrix.diagonal()[place]

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.errors import DivergenceError, SolveError
 from ddrecon.losses import Target
 from ddrecon.picture import render_each
 from ddrecon.ranks import sum_numbers
-from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
-from ddrecon.reconstruct.gradients import Differentiated
+from ddrecon.reconstruct.gradients import Differentiated, own_views
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import own_views
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
 from ddrecon.variables.values import variable_names, with_values
@@ -32,14 +31,17 @@ def target_of(view: View) -> Tensor:
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    `pictures` are this rank's images so far, by name, and `metrics` their losses and PSNRs in that
-    order, by kind.
+    `pictures` are this rank's images so far, by name, and `losses` and `psnrs` what they came to.
     """
 
     def __init__(self, views: Sequence[View], targets: Mapping[str, Target]):
         self.views, self.targets = views, targets
-        self.metrics: dict[str, list[Tensor]] = {"loss": [], "psnr": []}
+        self.forget()
+
+    def forget(self) -> None:
+        """Forgets all images."""
         self.pictures: dict[str, Tensor] = {}
+        self.losses, self.psnrs = list[Tensor](), list[Tensor]()
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its `image` add to the objective: its share, by weight, of the mean."""
@@ -53,21 +55,14 @@ class Comparison:
 
     def note(self, view: View, image: Tensor, loss: Tensor, psnr: Tensor | None = None) -> None:
         """Keeps the `image` of `view`, the `loss` that it adds, and its quality (`psnr`)."""
-        target = self.targets[view.name]
         self.pictures[view.name] = image
-        self.metrics["loss"].append(loss)
-        self.metrics["psnr"].append(target.psnr_of(image) if psnr is None else psnr)
+        self.losses.append(loss)
+        self.psnrs.append(self.targets[view.name].psnr_of(image) if psnr is None else psnr)
 
     def similarity(self) -> float:
         """The mean SSIM of all views."""
         values = [self.targets[name].ssim_of(image) for name, image in self.pictures.items()]
         return sum_numbers([float(sum(values))])[0] / len(self.views)
-
-    def forget(self) -> None:
-        """Forgets all images."""
-        self.pictures.clear()
-        for numbers in self.metrics.values():
-            numbers.clear()
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""
@@ -75,32 +70,36 @@ class Comparison:
 
     def require_finite(self) -> None:
         """Raises NotFiniteError where the loss of a view of this rank's is not finite."""
-        names = [view.name for view in self.views if view.name in self.pictures]
-        for name, loss in zip(names, self.metrics["loss"], strict=False):
+        for name, loss in zip(self.pictures, self.losses, strict=False):
             if not math.isfinite(loss):
                 raise NotFiniteError(f"the loss of view {name} is not finite")
 
     def read(
-        self,
-        objective: Differentiated,
-        penalty: Tensor,
-        parameters: Sequence[Parameter],
-    ) -> tuple[float, float, float]:
+        self, objective: Differentiated, penalty: Tensor, parameters: Sequence[Parameter]
+    ) -> tuple[float, float, float] | None:
         """The loss of images of an iteration, its `penalty`, and the images' mean PSNR [dB].
 
-        All are read at once, with the extremes of the derivatives. Raises NotFiniteError where a
-        loss, or a derivative by one of the `parameters`, is not finite.
+        All are read at once, with the extremes of the derivatives. None where a solve did not end.
+        Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not
+        finite.
         """
         gradients = objective.gradients
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-        groups = [[objective.loss, penalty], extremes, *self.metrics.values()]
+        residuals = [residual.to(penalty) for residual, _ in objective.residuals]
+        groups = [[objective.loss, penalty], residuals, extremes, self.psnrs]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
-        (of_images, prior), ends, *rows = (list(islice(flat, len(group))) for group in groups)
+        (of_images, prior), errors, ends, psnrs = (list(islice(flat, len(g))) for g in groups)
+        limits = (limit for _, limit in objective.residuals)
+        if not all(error <= limit for error, limit in zip(errors, limits, strict=True)):
+            return None
         if not all(map(math.isfinite, [of_images, prior, *ends])):
             self.require_finite()
-            require_finite(parameters, gradients)
+            for p in parameters:
+                if place := describe_flaw(p.name, gradients[p.name], p.is_field):
+                    slope = f"the derivative of the loss with respect to {place}"
+                    raise NotFiniteError(f"{slope} is not finite")
             raise NotFiniteError("the loss is not finite")
-        (psnr,) = sum_numbers([sum(row) for row in rows[1:]])
+        (psnr,) = sum_numbers([sum(psnrs)])
         return of_images, prior, psnr / len(self.views)
 
 
@@ -116,17 +115,17 @@ def render_quality(
     each best where exposures are among them.
     """
     variables, names = variable_names(scene), [view.name for view in scene.views]
-    rank_names, sums = own_views(scene, names), {"psnr": list[Tensor](), "ssim": list[Tensor]()}
+    psnrs, ssims = list[Tensor](), list[Tensor]()
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in variables}
         rendered = with_values(scene, values)
-        views = [rendered.view(name) for name in rank_names]
+        views = [rendered.view(name) for name in own_views(scene, names)]
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
             target = targets[view.name]
             fitted, _ = fit_held_out(image, view, target, response_sizes(parameters))
-            sums["psnr"].append(target.psnr_of(fitted))
-            sums["ssim"].append(target.ssim_of(fitted))
-    psnr, ssim = sum_numbers([float(sum(row)) for row in sums.values()])
+            psnrs.append(target.psnr_of(fitted))
+            ssims.append(target.ssim_of(fitted))
+    psnr, ssim = sum_numbers([float(sum(psnrs)), float(sum(ssims))])
     return psnr / len(names), ssim / len(names)
 
 
@@ -171,3 +170,55 @@ def fit_held_out(
         shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
         tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
     return max(tried, key=lambda attempt: float(target.psnr_of(attempt[0])))
+
+
+class NotFiniteError(Exception):
+    """A number of the iteration being made is not finite; the text says which."""
+
+
+def explain_divergence(
+    iteration: int, parameters: Sequence[Parameter], error: SolveError | NotFiniteError
+) -> DivergenceError:
+    """What is raised where `iteration`, counted from 1, failed by `error`.
+
+    It names the largest value of each of the `parameters`, and advises to bound them.
+    """
+    reason, residual, advice = str(error), math.nan, ""
+    if isinstance(error, SolveError):
+        residual = error.residual
+        reason = reason.partition(";")[0]
+        advice = f"{error.advice}, or "
+        if not math.isfinite(residual):
+            reason, advice = "the light is not finite", ""
+    largest = list[str]()
+    for p in parameters:
+        values = p.value.detach()
+        index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
+        largest.append(
+            f"{_name_entry(p.name, index, p.is_field)} is {float(values[tuple(index)]):.4g}"
+        )
+    names = " and ".join(f"optimize.parameters.{p.name}" for p in parameters)
+    return DivergenceError(
+        iteration,
+        f"{reason}; at most, {'; '.join(largest)}",
+        residual,
+        f"{advice}give another start (init) or bounds (min, max) to {names}",
+    )
+
+
+def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:
+    """The first entry of `values` that is not finite, as `density at voxel [x, y, z]`, or None.
+
+    `values` belong to the parameter `name`.
+    """
+    flaws = torch.nonzero(~torch.isfinite(values.detach()))
+    return _name_entry(name, flaws[0].tolist(), is_field) if len(flaws) else None
+
+
+def _name_entry(name: str, index: list[int], is_field: bool) -> str:
+    """An entry of the parameter `name` in words; places of fields and maps in world order."""
+    if not is_field and len(index) != 3:
+        return f"{name}, entry {index}" if index else name
+    kind, count = ("voxel", 3) if is_field else ("pixel", 2)
+    place, color = index[-count:][::-1], index[:-count]
+    return f"{name} at {kind} {place}" + (f", color {color[0]}" if color else "")

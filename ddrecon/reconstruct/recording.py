@@ -19,8 +19,7 @@ from torch import Tensor
 
 from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.kernels.graphs import GraphRecorder
-from ddrecon.numerics.reads import without_reads
+from ddrecon.numerics.remember import without_reads
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct.gradients import (
     Differentiated,
@@ -49,6 +48,33 @@ class Program:
     replay: Callable[[], object]
 
 
+class GraphRecorder:
+    """Records computations on a GPU as CUDA graphs, which a processor replays by one launch each.
+
+    They run in turn and share their memory, which goes with the last of them. A computation can be
+    recorded if Python reads none of its numbers and hands it none.
+    """
+
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
+
+    def __call__(self, computation: Callable[[], Any]) -> tuple[Any, Callable[[], object]]:
+        """What `computation` returns, not computed yet, and a function that computes it, in place.
+
+        Each replay overwrites its tensors. Raises RuntimeError where CUDA refuses to record.
+        """
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        # Constants, workspaces of libraries and modules of kernels are made in a run before.
+        with torch.cuda.stream(stream):
+            computation()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+            result = computation()
+        return result, graph.replay
+
+
 class Recording:
     """The programs of iterations of `scene` with `values`, as `record` makes them.
 
@@ -72,8 +98,8 @@ class Recording:
 
     def replay(
         self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
-    ) -> Differentiated | None:
-        """The derivative by `values`; None where a solve needs more iterations than it makes."""
+    ) -> Differentiated:
+        """The derivative by `values`, with the residuals of solves, which nobody has read."""
         # By `data`, whose changes nobody counts: the way back was recorded with other numbers.
         for name, value in self.values.items():
             value.data.copy_(values[name].detach())
@@ -99,27 +125,21 @@ class Recording:
             loss = loss + view_loss
             compared.note(view, image, view_loss, psnr)
         self.back.replay()
-        if not self._is_solved(memory):
-            return None
         gradients = {name: bar.clone() for name, bar in self.back.result.items()}
         memory.last |= {key: solution.clone() for key, solution in self.memory.last.items()}
-        return Differentiated(images, loss, gradients)
+        records = [*self.light_records, *self.back_records]
+        memory.records.extend(records)
+        tolerance, floors = self.scene.diffusion.tolerance, memory.tolerance_floor
+        residuals = [
+            (torch.as_tensor(record.residual), max(tolerance, floors.get(record.kind, 0.0)))
+            for record in records
+            if record.kind != "rounds"
+        ]
+        return Differentiated(images, loss, gradients, residuals)
 
     def _recorded(self, computation: Callable[[], Any]) -> Program:
         with without_reads():
             return Program(*self._record(computation))
-
-    def _is_solved(self, memory: SolveMemory) -> bool:
-        """Whether solves are as exact as `memory` asks; one read. Their records are kept there."""
-        records = [*self.light_records, *self.back_records]
-        residuals = torch.stack([torch.as_tensor(record.residual) for record in records]).tolist()
-        tolerance = self.scene.diffusion.tolerance
-        for record, residual in zip(records, residuals, strict=True):
-            floor = memory.tolerance_floor.get(record.kind, 0.0)
-            if record.kind != "rounds" and not residual <= max(tolerance, floor):
-                return False
-        memory.records.extend(records)
-        return True
 
     def _follow_light(self) -> Any:
         self.memory.records, self.memory.last = [], dict(self.guesses)
@@ -179,13 +199,16 @@ class Replays:
                 self.recording = self.recording or Recording(
                     self.scene, values, memory, self.new_recorder()
                 )
-                objective = self.recording.replay(values, compared, memory)
+                return self.recording.replay(values, compared, memory)
             except RuntimeError as error:
                 LOG.warning("iterations run without CUDA graphs: %s", str(error).split("\n")[0])
-                self.new_recorder = objective = None
-            if objective is not None:
-                return objective
-            self.recording = None
+                self.new_recorder = self.recording = None
+                compared.forget()
         names = [view.name for view in compared.views]
-        compared.forget()
         return differentiate(self.scene, names, values, compared, memory)
+
+    def forget(self, compared: Comparison, memory: SolveMemory) -> None:
+        """Has the next iteration run plainly: a solve needs more iterations than were recorded."""
+        self.recording = None
+        memory.iterations.clear()
+        compared.forget()

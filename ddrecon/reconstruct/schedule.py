@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ddrecon.light.lights import AmbientLight
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.search import Search
@@ -23,7 +24,8 @@ class Stage:
     """A part of a run: at one `level` of resolution; the parameters called `waiting` rest in it.
 
     A trial begins denser than the last stage ended, which it replaces where it explains the
-    pictures better: what is lit from all around looks alike where it is thin and where it is dark.
+    pictures better: what is lit alike from all around looks the same where it is thin and where it
+    is dark. Other lights tell.
     """
 
     level: int
@@ -59,10 +61,12 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
     lit = [p for p in visible if not (scene.lights and p.key == "emission" and len(visible) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
-    if is_empty and any(p.key == "density" for p in lit):
-        # The stage after the trial begins with the better of two volumes.
-        again = stages[:1] if len(stages) == 1 else []
-        stages = [stages[0], Stage(stages[0].level, is_trial=True), *stages[1:], *again]
+    if is_empty:
+        is_even = all(isinstance(light, AmbientLight) for light in scene.lights)
+        has_trial = is_even and any(p.key == "density" for p in lit)
+        trial = [Stage(stages[0].level, is_trial=True)] * has_trial
+        # The metric of the first stage is that of nothing: what is there takes its own.
+        stages = [stages[0], *trial, *(stages[1:] or stages)]
     return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages
 
 
@@ -92,7 +96,6 @@ class Schedule:
         progress, is_last = self.progress, self.progress.stage == len(self.stages) - 1
         share = (self.most - progress.began) // 2
         is_short = not is_last and iteration - progress.began >= max(share, 1)
-        is_vain = self.stage.is_trial and search.objective.loss > tuning.UNLIKE
         is_at_rest = search.gain < tuning.REST
         # A finer level begins with the bulk: from there a light prior lets it fit noise alone.
         is_light = search.weight * search.objective.prior < tuning.LIGHT * search.objective.loss
@@ -100,7 +103,7 @@ class Schedule:
         # Noise of which images are short by far was estimated too high.
         is_noise = noise_loss / 2 <= search.objective.loss <= noise_loss
         is_explained = is_refined and is_light and is_noise
-        if not (is_at_rest or is_explained or is_short or is_vain):
+        if not (is_at_rest or is_explained or is_short):
             return
         if not is_last:
             # What has not come to rest has no trial: the two could not be compared.

@@ -66,10 +66,11 @@ class Search:
 
     `values` are the last candidate accepted, none at first, and `objective` what was found there.
     The prior counts by `weight`. `pairs` are the last accepted moves and the changes of both
-    derivatives. The next candidate is `step` times `direction` away, along which the loss falls by
-    `slope`; `is_stuck` where no step helps. `scales` are how long the metric is, by group of
-    values, as the last pair had it. `gains` are what the loss could still fall by, as part of it,
-    at the last values.
+    derivatives. The next `candidate` is `step` times `direction` away, within bounds, which is a
+    `move`. As far as derivatives tell, the loss falls by `slope` along that direction and by
+    `promise` in that move; `is_stuck` where no step helps. `scales` are how long the metric is, by
+    group of values, as the last pair had it. `gains` are what the loss could still fall by, as part
+    of it, at the last values.
     """
 
     space: Space
@@ -78,7 +79,10 @@ class Search:
     weight: float = 1.0
     pairs: list[tuple[Values, Values, Values]] = field(default_factory=list)
     direction: Values = field(default_factory=dict)
+    candidate: Values = field(default_factory=dict)
+    move: Values = field(default_factory=dict)
     slope: float = 0.0
+    promise: float = 0.0
     step: float = 1.0
     scales: dict[str, float] = field(default_factory=dict)
     gains: list[float] = field(default_factory=list)
@@ -95,13 +99,6 @@ class Search:
             return 0.0
         return max(self.gains) if len(self.gains) == tuning.GAINS else math.inf
 
-    def candidate(self) -> Values:
-        """The next values to evaluate the objective at."""
-        moved = {
-            n: torch.add(v, self.direction[n], alpha=self.step) for n, v in self.values.items()
-        }
-        return self.space.project(moved)
-
     @property
     def loss(self) -> float:
         """The objective at the values accepted last."""
@@ -113,18 +110,16 @@ class Search:
         A loss that is not finite is as if it were too large.
         """
         if self.values:
-            move = {name: value - self.values[name] for name, value in values.items()}
-            promise = _read(_dot(move, self.objective.slopes(self.weight)))
             loss = objective.total(self.weight)
-            if not loss <= self.loss + tuning.SUFFICIENT * promise:
-                self._shorten(loss, promise)
+            if not loss <= self.loss + tuning.SUFFICIENT * self.promise:
+                self._shorten(loss)
                 return False
             old = self.objective
             changes = (
                 _combine(objective.gradients, old.gradients, -1),
                 _combine(objective.prior_gradients, old.prior_gradients, -1),
             )
-            self.pairs = [*self.pairs, (move, *changes)][-tuning.PAIRS :]
+            self.pairs = [*self.pairs, (self.move, *changes)][-tuning.PAIRS :]
         self.values, self.objective = values, objective
         self.aim()
         return True
@@ -137,27 +132,50 @@ class Search:
     def aim(self) -> None:
         """Sets out anew from the values accepted last."""
         gradients = self.objective.slopes(self.weight)
-        self.direction = self._find_direction(gradients, self.space.free(self.values, gradients))
-        self.slope = min(_read(_dot(self.direction, gradients)), 0.0)
+        free = self.space.free(self.values, gradients)
+        self.direction, ratios = self._find_direction(gradients, free)
+        slope, *lengths = self._set_out(1.0, _dot(self.direction, gradients), *ratios.values())
+        measured = zip(ratios, lengths, strict=True)
+        self.scales |= {group: length for group, length in measured if 0 < length < math.inf}
+        self.slope = min(slope, 0.0)
         self.is_stuck = self.slope == 0
-        # A loss of squares is never below 0, so the first step need not promise more than that.
-        self.step = 1.0 if self.scales or self.is_stuck else min(1.0, self.loss / -self.slope)
+        if not (self.scales or self.is_stuck):
+            # A loss of squares is never below 0: the first step need not promise more than that.
+            self._set_out(min(1.0, self.loss / -self.slope))
         if self.pairs and self.loss > 0:
             self.gains = [*self.gains, -self.slope / 2 / self.loss][-tuning.GAINS :]
 
-    def _shorten(self, loss: float, promise: float) -> None:
+    def _set_out(self, step: float, *numbers: Tensor) -> list[float]:
+        """Has the next candidate `step` times the direction away; reads `numbers` with its promise.
+
+        All ranks decide by those of the first.
+        """
+        moved = {n: torch.add(v, self.direction[n], alpha=step) for n, v in self.values.items()}
+        self.step, self.candidate = step, self.space.project(moved)
+        self.move = {name: value - self.values[name] for name, value in self.candidate.items()}
+        promise = _dot(self.move, self.objective.slopes(self.weight))
+        self.promise, *others = from_first(torch.stack([promise, *numbers]).tolist())
+        return others
+
+    def _shorten(self, loss: float) -> None:
         """Shortens the step to where the parabola through what is known is lowest."""
-        excess = loss - self.loss - promise
-        factor = -promise / (2 * excess) if excess > 0 and math.isfinite(excess) else 0.5
+        excess = loss - self.loss - self.promise
+        factor = -self.promise / (2 * excess) if excess > 0 and math.isfinite(excess) else 0.5
         self.step *= min(max(factor, 0.1), 0.5)
-        if self.step < tuning.SHORTEST:
+        if self.step >= tuning.SHORTEST:
+            self._set_out(self.step)
+        else:
             self.is_stuck = not self.pairs
             self.pairs = []
             if not self.is_stuck:
                 self.aim()
 
-    def _find_direction(self, gradients: Values, free: Values) -> Values:
-        """Minus the inverse Hessian, as pairs have it, times the `gradients` of what is free."""
+    def _find_direction(self, gradients: Values, free: Values) -> tuple[Values, dict[str, Tensor]]:
+        """Minus the inverse Hessian, as pairs have it, times the `gradients` of what is free.
+
+        And how long the last pair has the metric, by group; where that is no length, the one known
+        is taken.
+        """
         residual = {name: bar * free[name] for name, bar in gradients.items()}
         pairs = list[tuple[Values, Values, Tensor]]()
         for move, of_loss, of_prior in self.pairs:
@@ -172,27 +190,31 @@ class Search:
         # The last change goes along: for a GPU two vectors are as many launches as one.
         vectors = [residual, *(change for _, change, _ in pairs[-1:])]
         result, *promised = self.space.metric(self.values, free)(vectors)
-        if promised:
-            self._measure(*pairs[-1][:2], *promised)
-        groups = {name: self.space.group(name) for name in result}
-        result = {name: value * self.scales.get(groups[name], 1) for name, value in result.items()}
+        ratios = self._measure(*pairs[-1][:2], *promised) if promised else {}
+        for name, value in result.items():
+            group = self.space.group(name)
+            length = self.scales.get(group, 1.0)
+            if group in ratios:
+                measured = torch.where(ratios[group] > 0, ratios[group], length)
+                result[name] = value * (measured if value.ndim else measured.to(value))
+            else:
+                result[name] = value * length
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
             result = _add(result, move, weight - inverse * _dot(change, result))
-        return {name: -free[name] * value for name, value in result.items()}
+        return {name: -free[name] * value for name, value in result.items()}, ratios
 
-    def _measure(self, move: Values, change: Values, promised: Values) -> None:
-        """Takes from a `move`, and from the one `promised` for its `change`, the metric's length.
+    def _measure(self, move: Values, change: Values, promised: Values) -> dict[str, Tensor]:
+        """The metric's length by group, from a `move` and the one `promised` for its `change`.
 
         The metric knows directions; of fields and of numbers it errs by different factors.
         """
         names: dict[str, list[str]] = {}
         for name in move:
             names.setdefault(self.space.group(name), []).append(name)
-        for group, members in names.items():
-            of_group = {name: change[name] for name in members}
-            ratio = _read(_dot(of_group, move) / _dot(of_group, promised))
-            if 0 < ratio < math.inf:
-                self.scales[group] = ratio
+        of_groups = {
+            group: {name: change[name] for name in members} for group, members in names.items()
+        }
+        return {g: _dot(bars, move) / _dot(bars, promised) for g, bars in of_groups.items()}
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
@@ -219,11 +241,6 @@ def _dot(first: Values, second: Values) -> Tensor:
     """The sum of products of entries, in float64."""
     products = [(bar * second[name]).sum(dtype=torch.float64) for name, bar in first.items()]
     return reduce(torch.add, products)
-
-
-def _read(number: Tensor) -> float:
-    """The `number` as the first rank has it, by which all of them decide alike."""
-    return from_first(float(number))
 
 
 def _combine(first: Values, second: Values, weight: float) -> Values:

@@ -11,9 +11,8 @@ from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
-from ddrecon.reconstruct.divergence import describe_flaw
 from ddrecon.reconstruct.levels import factors, scene_at_level
-from ddrecon.reconstruct.objective import target_of
+from ddrecon.reconstruct.objective import describe_flaw, target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene, View
@@ -40,6 +39,11 @@ class Problem:
     power: float
     support: Support | None
     factors: Sequence[int]
+
+    @property
+    def unit(self) -> float:
+        """What losses are relative to: the power, unless all targets are black."""
+        return self.power or 1.0
 
     @staticmethod
     def of(scene: Scene, iterations: Iterations | None = None) -> Problem:

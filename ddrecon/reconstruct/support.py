@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import cast_rays
+from ddrecon.cameras import Rays, cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.hull import (
@@ -22,7 +22,7 @@ from ddrecon.hull import (
     find_shown,
     hull_of,
 )
-from ddrecon.march.box import cross_box
+from ddrecon.march.box import Crossing, cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
@@ -74,39 +74,11 @@ class Support:
             hull_of(view.camera, shown, grid, self.margin)
             for view, shown in zip(self.views, self.shown, strict=True)
         ]
-        may_hold, seen = zip(*pairs, strict=True)
-        return torch.stack(may_hold), torch.stack(seen)
-
-    def cut_pixels(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
-        """The pixels of each view that show something where no cell of `grid` is left.
-
-        Yields their indices among every n-th of the pixels that show something, n, and for each
-        view how many of these pixels it alone has left without a cell.
-        """
-        may_hold, seen = self._hulls(grid)
-        leaves_out = (~may_hold & seen).flatten(1)
-        for view, shown in zip(self.views, self.shown, strict=True):
-            every = 1 + int(shown.sum()) // TRACED_PIXELS
-            index = shown.flatten().nonzero()[::every, 0]
-            rays = cast_rays(view.camera).select(index)
-            crossing = cross_box(grid, rays)
-            index, rays = index[crossing.hit], rays.select(crossing.hit)
-            count = 2 * max(grid.shape)
-            far = (torch.arange(count, device=index.device) + 0.5) / count
-            far = crossing.near[:, None] + far * (crossing.far - crossing.near)[:, None]
-            places = rays.origin[:, None] + far[..., None] * rays.direction[:, None]
-            low, step = (places.new_tensor(x) for x in (grid.lower, grid.spacing))
-            most = index.new_tensor(grid.shape) - 1
-            z, y, x = ((places - low) / step).long().clamp(min=0).minimum(most).unbind(-1)
-            out = leaves_out[:, (z * grid.shape[1] + y) * grid.shape[2] + x]
-            is_cut, by = (out.any(0)).all(1), out.sum(0)
-            alone = [int((is_cut & ((by == 1) & outside).any(1)).sum()) for outside in out]
-            yield index[is_cut], every, alone
+        may_hold, seen = map(torch.stack, zip(*pairs, strict=True))
+        return may_hold, seen
 
 
-def describe_support(
-    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
-) -> dict[str, Any] | None:
+def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
     `cells` is the part of the cells of `grid` that any keeps, `lonely` that of which fewer than two
@@ -114,7 +86,7 @@ def describe_support(
     """
     if not supports:
         return None
-    described = doubt_support(supports, grid, upright)
+    described = doubt_support(supports, grid)
     if not described.get("doubt", "").startswith(OUTSIDE):
         kept = torch.stack([support.on(grid) for support in supports]).any(0)
         _, seen = supports[0]._hulls(grid)
@@ -123,31 +95,43 @@ def describe_support(
     return described
 
 
-def doubt_support(
-    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
-) -> dict[str, Any]:
+def doubt_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any]:
     """The corners (x, y, z) of the `box` that would do, and what is in `doubt` of that of `grid`.
 
-    Neither where the pictures do not tell; `upright` is as for `doubt_box`.
+    Neither where the pictures do not tell.
     """
     with suppress(HullError):
         frames = [(support.views, support.shown) for support in supports]
         box = bound_smoke(frames, supports[0].margin)
-        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz), upright)
+        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz))
         return {"box": box.tolist()} | ({} if doubt is None else {"doubt": doubt})
     return {}
 
 
 def find_cut(support: Support, grid: Grid) -> str | None:
     """Whether `support` leaves no cell of `grid` where views show smoke, and which view does it."""
+    may_hold, seen = support._hulls(grid)
+    leaves_out = (~may_hold & seen).flatten(1)
     cut, by = dict[str, float](), [0] * len(support.views)
-    for view, (index, every, alone) in zip(support.views, support.cut_pixels(grid), strict=True):
+    for view, shown in zip(support.views, support.shown, strict=True):
         assert view.image is not None
-        strength = (view.image - (0.0 if view.background is None else view.background)).abs()
-        light = strength.amax(0).flatten()
-        share = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
+        light = (view.image - (0.0 if view.background is None else view.background)).abs()
+        light = light.amax(0).flatten()
+        every = 1 + int(shown.sum()) // TRACED_PIXELS
+        index = shown.flatten().nonzero()[::every, 0]
+        rays = cast_rays(view.camera).select(index)
+        crossing = cross_box(grid, rays)
+        index, rays = index[crossing.hit], rays.select(crossing.hit)
+        out = leaves_out[:, _cells_along(grid, rays, crossing)]
+        is_cut, count = out.any(0).all(1), out.sum(0)
+        share = every * float(light[index[is_cut]].sum()) / float(light.sum().clamp(min=1e-30))
         if share > CUT_LIGHT:
-            cut[view.name], by = share, [a + b for a, b in zip(by, alone, strict=True)]
+            cut[view.name] = share
+            # Pixels that show something again once one view is left out.
+            by = [
+                n + int((is_cut & ((count == 1) & o).any(1)).sum())
+                for n, o in zip(by, out, strict=True)
+            ]
     if not cut:
         return None
     names = ", ".join(f"{name} ({100 * share:.2g} % of its light)" for name, share in cut.items())
@@ -155,6 +139,18 @@ def find_cut(support: Support, grid: Grid) -> str | None:
     if max(by) > 0:
         blamed = f"camera {support.views[by.index(max(by))].name}, which alone shows nothing there"
     return f"support? it cuts off what views show: {names}; check {blamed}, or raise {KEY}_margin"
+
+
+def _cells_along(grid: Grid, rays: Rays, crossing: Crossing) -> Tensor:
+    """The cells [R, N] that each of the `rays` passes between both ends of its `crossing`."""
+    count = 2 * max(grid.shape)
+    far = (torch.arange(count, device=rays.origin.device) + 0.5) / count
+    far = crossing.near[:, None] + far * (crossing.far - crossing.near)[:, None]
+    places = rays.origin[:, None] + far[..., None] * rays.direction[:, None]
+    low, step = (places.new_tensor(x) for x in (grid.lower, grid.spacing))
+    cells = ((places - low) / step).long().clamp(min=0)
+    z, y, x = cells.minimum(cells.new_tensor(grid.shape) - 1).unbind(-1)
+    return (z * grid.shape[1] + y) * grid.shape[2] + x
 
 
 def support_text(support: dict[str, Any]) -> str:

@@ -34,9 +34,8 @@ which the loss of images falls at least, or else it is not the prior that keeps 
 
 LIGHT = 0.5
 """A prior that weighs less than this part of the loss does not keep noise out of a volume."""
-DENSER, UNLIKE, BETTER = 4.0, 0.1, 0.9
-"""How much denser a trial begins; the loss, as a part of that of black pictures, above which
-pictures tell such a density apart; and the part of the last stage's loss that makes it better."""
+DENSER, BETTER = 4.0, 0.9
+"""How much denser a trial begins, and the part of the last stage's loss that makes it better."""
 
 # The metric of numbers (E10.2).
 APART, CLOSE = 0.5, 1e-5

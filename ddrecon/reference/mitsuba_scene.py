@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +28,7 @@ from ddrecon.light.environment import rotate_directions
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Mixture
+from ddrecon.medium.phase import HenyeyGreenstein, Mixture, PhaseFunction, Rayleigh
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024
@@ -53,6 +52,24 @@ SQUARE = 1e-5
 FAR = 100.0
 """Half the width of a ground, in diagonals of the box: it ends half a degree below the horizon."""
 MEDIUM = "medium"
+MITSUBA_AXES = np.array([-1, 1, -1, 1])
+"""Signs of a camera's axes: Mitsuba's look along +z with +x to the left."""
+
+
+class Lamp(NamedTuple):
+    """What Mitsuba calls a light, and its class; `place` and `color` are named as ours are."""
+
+    plugin: str
+    class_name: str
+    place: str
+    color: str
+
+
+LAMPS: dict[type, Lamp] = {
+    DirectionalLight: Lamp("directional", "DirectionalEmitter", "direction", "irradiance"),
+    PointLight: Lamp("point", "PointLight", "position", "intensity"),
+}
+"""Lights that differ from Mitsuba's in nothing, scene files included."""
 
 
 def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[str, Any]:
@@ -227,27 +244,17 @@ def _ground(ground: Ground, grid: Grid) -> dict[str, dict[str, Any]]:
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
-    """The camera of `view`, whose film keeps the mean of each pixel.
-
-    Mitsuba's cameras look along +z with +x to the left.
-    """
-    camera = view.camera
+    """The camera of `view`, whose film keeps the mean of each pixel."""
+    camera, matrix, diagonal = view.camera, np.eye(4), math.hypot(*grid.extent)
+    matrix[:3] = camera.pose.detach().cpu().double().numpy()
     height, width = camera.size
-    right, up, backward, origin = camera.pose.detach().cpu().double().numpy().T
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([-right, up, -backward, origin], axis=1)
-    diagonal = math.hypot(*grid.extent)
+    film = {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"}
     sensor: dict[str, Any] = {
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
+        "film": film | {"rfilter": {"type": "box"}},
         "sampler": {"type": "independent", "sample_count": SAMPLES},
         "near_clip": NEAR * diagonal,
-        "far_clip": 2 * (FAR * diagonal + math.dist(origin, grid.center_xyz)),
+        "far_clip": 2 * (FAR * diagonal + math.dist(matrix[:3, 3], grid.center_xyz)),
+        "to_world": matrix * MITSUBA_AXES,
     }
     start = cast_rays(camera).origin.detach()
     lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
@@ -277,12 +284,11 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
             "fov_axis": "x",
             "principal_point_offset_x": 0.5 - x,
             "principal_point_offset_y": 0.5 - y,
-            "to_world": matrix,
             **sensor,
         }
     half_width = float(camera.half_width)
-    scale = np.diag([half_width, half_width * camera.pixel_aspect, 1.0, 1.0])
-    return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
+    sensor["to_world"] = sensor["to_world"] * [half_width, half_width * camera.pixel_aspect, 1, 1]
+    return {"type": "orthographic", **sensor}
 
 
 def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
@@ -295,18 +301,9 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
     emitters: dict[str, dict[str, Any]] = {}
     ambient, maps = np.zeros(3), list[EnvironmentLight]()
     for index, light in enumerate(lights):
-        if isinstance(light, DirectionalLight):
-            emitters[f"light_{index}"] = {
-                "type": "directional",
-                "direction": light.direction.tolist(),
-                "irradiance": _color(light.irradiance),
-            }
-        elif isinstance(light, PointLight):
-            emitters[f"light_{index}"] = {
-                "type": "point",
-                "position": light.position.tolist(),
-                "intensity": _color(light.intensity),
-            }
+        if lamp := LAMPS.get(type(light)):
+            place, color = getattr(light, lamp.place).tolist(), _color(getattr(light, lamp.color))
+            emitters[f"light_{index}"] = {"type": lamp.plugin, lamp.place: place, lamp.color: color}
         elif isinstance(light, AmbientLight):
             ambient = ambient + _color(light.radiance)
         elif isinstance(light, EnvironmentLight):

@@ -1,4 +1,7 @@
-"""Volumes within a page: turned, seen through and cut by its scripts, as pictures without them."""
+"""Volumes within a page: turned, seen through and cut by its scripts, as pictures without them.
+
+In a notebook they are shown in a frame of their own.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import gzip
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import torch
@@ -17,7 +21,9 @@ from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid, array_order
 from ddrecon.io.images.table import png_of
 from ddrecon.light.lights import DirectionalLight, PointLight
+from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures import srgb
+from ddrecon.report.page import page_text
 from ddrecon.report.pictures import diverge, find_high, slices
 from ddrecon.scene import Scene
 from ddrecon.turntable import upright_axis
@@ -29,6 +35,9 @@ SIDEWAYS = (1.3, 1.0, 2.5)
 REACH, FARTHEST = 0.25, 2.0
 """How far a camera's frustum is drawn, as part of its distance from the volume's middle, which for
 an orthographic one is at most so many of the box's longest sides."""
+FRAME_HEIGHT = 640
+"""Pixels of the frame."""
+FIELDS = ("density", "sigma_a", "sigma_s")
 
 
 @dataclass(frozen=True)
@@ -140,3 +149,33 @@ def _embed(field: Shown, most: int) -> dict[str, Any]:
         "channels": cells.shape[-1],
         "data": base64.b64encode(packed).decode("ascii"),
     }
+
+
+class Drawn(str):
+    """HTML that a notebook shows."""
+
+    def _repr_html_(self) -> str:
+        return self
+
+
+def show(shown: Scene | Volume) -> Drawn:
+    """The fields of a volume, or of a scene's, to turn and to cut in a notebook.
+
+    A scene is seen from its first camera. The frame's scripts reach nothing of the notebook.
+    """
+    scene = shown if isinstance(shown, Scene) else None
+    volume = shown.volume if isinstance(shown, Scene) else shown
+    lights = f"; {len(scene.lights)} lights, {len(scene.views)} views" if scene else ""
+    cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
+    words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"
+    fields = {name: getattr(volume, name).detach() for name in FIELDS}
+    fields = {name: value for name, value in fields.items() if value.ndim >= 3}
+    viewed = [
+        Shown(name, "result", value, find_white_value(value)) for name, value in fields.items()
+    ]
+    volume_section = describe_volume(viewed, describe_world(volume.grid, scene))
+    page = page_text(title="ddrecon", lead=words, volume=volume_section, is_small=True)
+    return Drawn(
+        f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '
+        f'style="width: 100%; height: {FRAME_HEIGHT}px; border: 0"></iframe>'
+    )

@@ -1,4 +1,4 @@
-"""The reconstruction of a run, and how good its pictures are, for its report and its summary.
+"""The reconstruction of a run, how good its pictures are, and what seems to be wrong with it.
 
 A held-out camera may err as all do, and then says more of itself than of the volume. So views held
 out are registered as well: their pose and exposure are fitted to the finished volume, by Gauss and
@@ -7,8 +7,10 @@ Newton with the slopes of where they were given, by differences: shifts are smal
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import mean, median
 from typing import Any
 
 import torch
@@ -22,11 +24,12 @@ from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
 from ddrecon.pictures.scales import COMPARED, LINEAR
-from ddrecon.progress import Progress
+from ddrecon.progress import show_progress
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.objective import fit_held_out, response_sizes
+from ddrecon.reconstruct.objective import fit_held_out, response_sizes, target_of
 from ddrecon.reconstruct.setup import choose_loss, targets_of
+from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.kinds import is_of_volume, pose_change
@@ -38,6 +41,18 @@ DAMPING = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
 LARGEST_STEP = 40.0
 """No step is farther than so many rates, of a quarter of a pixel."""
+OVERFIT = 6.0
+"""Held-out views this much worse than those trained on [dB] are not explained by noise."""
+FACTOR = 1.15
+"""A view whose brightness is off by this factor, against the others, was exposed differently."""
+SHIFT = 0.5
+"""A render that fits better when moved by more pixels was seen by another camera."""
+EXPLAINED, MOVED = 0.3, 0.2
+"""The parts of a residual that a factor and a move have to explain; a volume that was fitted to the
+other views hides some of a move."""
+WORTHWHILE = 0.1
+"""A run is unfinished where its loss can fall by this part of it."""
+MOST_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -54,34 +69,36 @@ class Findings:
     images: Mapping[str, Tensor]
     quality: Mapping[str, Mapping[str, Any]]
 
+    @property
+    def seen(self) -> list[View]:
+        """The views that have a target."""
+        return [view for view in self.scene.views if view.image is not None]
 
-def find_results(run: Reconstruction, progress: Progress | None = None) -> Findings:
-    """The current result of `run`, rendered; with a `progress`, held-out views are registered."""
-    scene = run.current_scene()
-    shown = [view for view in scene.views if view.image is not None]
-    targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
+
+def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
+    """The current result of `run`, rendered; if it `is_last`, held-out views are registered."""
+    scene, sizes = run.current_scene(), response_sizes(run.parameters)
     images, quality = dict[str, Tensor](), dict[str, dict[str, Any]]()
+    findings = Findings(scene, _find_truths(run.problem.scene), images, quality)
+    shown = replace(scene, views=findings.seen)
+    targets = targets_of(shown, run.problem.loss, run.problem.noises)
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
-        for view in shown:
-            target, sizes = targets[view.name], response_sizes(run.parameters)
-            fitted = dict[str, Tensor]()
+        for view in show_progress(shown.views, "register") if is_last else shown.views:
+            target, fitted = targets[view.name], dict[str, Tensor]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
                 picture, fitted = fit_held_out(picture, view, target, sizes)
             images[view.name] = picture
-            quality[view.name] = {
+            told = quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
-        held_out = [view for view in shown if view.is_test]
-        for view in progress(held_out, "register") if progress and held_out else ():
-            target = targets[view.name]
-            registered = register(light_field, scene, view, target, response_sizes(run.parameters))
-            quality[view.name]["registered"] = registered
-    return Findings(scene, _find_truths(run.problem.scene), images, quality)
+            if is_last and view.is_test:
+                told["registered"] = register(light_field, scene, view, target, sizes)
+    return findings
 
 
 def _find_truths(scene: Scene) -> dict[str, Tensor]:
@@ -170,3 +187,126 @@ def shift_between(camera: Camera, other_camera: Camera, volume: Volume) -> float
     shift = (place - moved).norm(dim=1).to(weight)
     weight = weight[weight > 0] * shift.isfinite()
     return float((weight * shift).nansum() / weight.sum())
+
+
+def diagnose(
+    findings: Findings,
+    iteration: int,
+    gain: float,
+    support: Support | None = None,
+    doubt: str | None = None,
+) -> list[dict[str, str]]:
+    """What seems to be wrong with a run, by its `findings`.
+
+    After so many iterations the loss can fall by its part `gain`; `support` is where density was
+    sought, and `doubt` what is odd in its box. Each is a word that names its `kind`, and a
+    sentence, its `text`.
+    """
+    scene, quality = findings.scene, findings.quality
+    train, test = ([v for v in findings.seen if v.is_test is is_test] for is_test in (False, True))
+    overfit = None
+    if train and test:
+        psnrs = (mean(quality[view.name]["psnr"] for view in views) for views in (train, test))
+        worse = next(psnrs) - next(psnrs)
+        overfit = worse >= OVERFIT and (
+            f"overfit: views held out are {worse:.1f} dB worse than those trained on; raise "
+            "optimize.parameters.density.tv, add views, take the bounds that `ddrecon check` "
+            "prints, or look for cameras that are off"
+        )
+    if support is not None:
+        doubt = f"volume.bounds? {doubt}" if doubt else find_cut(support, scene.volume.grid)
+    # What is overfit would only become more so.
+    unfinished = None if overfit else find_unfinished(gain, iteration)
+    texts = {"overfit": overfit, "support": doubt}
+    texts |= find_odd(train, findings.images, gain) | {"unfinished": unfinished}
+    return [{"kind": kind, "text": text} for kind, text in texts.items() if text]
+
+
+def find_odd(views: Sequence[View], images: Mapping[str, Tensor], gain: float) -> dict[str, str]:
+    """Which renders, of `images`, fit the pictures of `views` better by a factor, or when moved.
+
+    Factors count from the usual one. The loss can still fall by its part `gain`.
+    """
+    factors = {view.name: best_factor(view, images[view.name], 1.0)[0] for view in views}
+    usual = median(factors.values()) if len(views) > 2 else 1.0
+    # What is not yet explained is no picture's fault as long as going on may explain it. It is all
+    # where a run is too short to tell, and where renders as a whole lack the usual factor.
+    to_come = min(gain, 1.0) if abs(math.log(usual)) <= math.log(FACTOR) else 1.0
+    lit, moved = dict[str, float](), dict[str, float]()
+    for view in views:
+        factor, explained = best_factor(view, images[view.name], usual)
+        if abs(math.log(factor)) > math.log(FACTOR) and explained > max(EXPLAINED, to_come):
+            lit[view.name] = factor
+        move, explained = best_shift(view, images[view.name])
+        if math.hypot(*move) > SHIFT and explained > max(MOVED, to_come):
+            moved[view.name] = math.hypot(*move)
+    brightest = sorted(lit.items(), key=lambda item: -abs(math.log(item[1])))[:MOST_NAMED]
+    farthest = sorted(moved.items(), key=lambda item: -item[1])[:MOST_NAMED]
+    texts = dict[str, str]()
+    if lit:
+        texts["exposure"] = (
+            "exposure? pictures brighter or darker, as a whole, than the others say: "
+            f"{', '.join(f'{name} ({factor:.2f} times)' for name, factor in brightest)}; give all "
+            "one exposure and white balance, or optimize them (views.*.exposure)"
+        )
+    if moved:
+        texts["cameras"] = (
+            "cameras? renders fit better when moved: "
+            f"{', '.join(f'{name} ({pixels:.1f} pixels)' for name, pixels in farthest)}; check "
+            "poses and intrinsics, or optimize the poses (views.NAME.camera)"
+        )
+    return texts
+
+
+def find_unfinished(gain: float, iteration: int) -> str | None:
+    """Whether going on after so many iterations would lower the loss, by its part `gain`.
+
+    It is infinite in a run that is too short to tell.
+    """
+    if not WORTHWHILE <= gain < math.inf:
+        return None
+    much = f"some {100 * gain:.0f} %" if gain < 0.5 else "more than half"
+    return (
+        f"unfinished: the loss can still fall, by {much} as the search has it; "
+        f"go on with --resume --iterations {2 * iteration}"
+    )
+
+
+def best_factor(view: View, image: Tensor, usual: float) -> tuple[float, float]:
+    """The factor on the `usual` times the render `image` by which it fits best.
+
+    And the part that it explains of what the usual factor leaves.
+    """
+    (change,), explained = explain(view, target_of(view) - usual * image, image[None])
+    return max(1 + change / usual, 1e-12), explained
+
+
+def best_shift(view: View, image: Tensor) -> tuple[list[float], float]:
+    """The shift in pixels (right, down) by which the render `image` [3, h, w] fits best.
+
+    Also returns the part of the residual to the picture of `view` that the shift explains. The
+    shift is one Gauss-Newton step: the residual is fitted by the derivatives of the render along
+    both axes (central differences; Lucas and Kanade 1981).
+    """
+    # A render moved to the right by d is r(x - d): it changes by -d times its derivative.
+    slopes = torch.zeros(2, *image.shape).to(image)
+    slopes[0, :, 1:-1, 1:-1] = (image[:, 1:-1, :-2] - image[:, 1:-1, 2:]) / 2
+    slopes[1, :, 1:-1, 1:-1] = (image[:, :-2, 1:-1] - image[:, 2:, 1:-1]) / 2
+    residual = torch.zeros_like(image)
+    residual[:, 1:-1, 1:-1] = (target_of(view) - image)[:, 1:-1, 1:-1]
+    return explain(view, residual, slopes)
+
+
+def explain(view: View, residual: Tensor, slopes: Tensor) -> tuple[list[float], float]:
+    """The factors of `slopes` [n, 3, h, w] that fit a `residual` [3, h, w] best, by least squares.
+
+    And the part of it that they explain. Pixels count where the mask of `view` is not black.
+    """
+    weight, count = 1.0 if view.mask is None else view.mask, len(slopes)
+    slopes, residual = (slopes * weight).double().flatten(1), (residual * weight).double().flatten()
+    normal, total = slopes @ slopes.T, float(residual @ residual)
+    if total == 0 or float(torch.linalg.det(normal)) <= 1e-9 * float(normal.trace()) ** count:
+        return [0.0] * count, 0.0
+    factors = torch.linalg.solve(normal, slopes @ residual)
+    left = residual - factors @ slopes
+    return factors.tolist(), 1 - float(left @ left) / total

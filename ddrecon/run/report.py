@@ -17,15 +17,14 @@ from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
 from ddrecon.pictures import srgb
-from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.report.curve import Plot, draw_curve
-from ddrecon.report.page import write_page
+from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.quality import Findings, shift_between
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene
 from ddrecon.terms import needed_terms
 from ddrecon.variables.values import fields_of
 
@@ -42,6 +41,8 @@ FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder
 """Why held-out views seem to get worse where the resolution changes."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
+Field = tuple[str, str, Tensor, int | None]
+"""A name, `result` or `truth`, values [..., z, y, x], and the frame of a film."""
 
 
 def write_run_report(
@@ -56,19 +57,33 @@ def write_run_report(
 
     `numbers` are those of `list_numbers`.
     """
-    scene = findings.scene
+    scene, left_out = findings.scene, list[str]()
+    cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
+    lead = (
+        f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
+        f"{psnr_text(summary)}; all compare {summary['compared']}. "
+        f"The loss is {summary['loss_function']}. It {summary['ended']['text']}."
+    )
+    if "support" in summary:
+        share = 100 * (1 - summary["support"]["cells"])
+        left_out = [f"Left out by the support: {share:.3g} % of the cells."]
+    kinds = {"result": fields_of(scene), "truth": findings.truths}.items()
+    fields = [(name, of, value, None) for of, known in kinds for name, value in known.items()]
+    steps = [row for previous, row in pairwise(rows) if row.cells != previous.cells]
+    at = ", ".join(str(row.iteration) for row in steps)
+    finer = f"A line from top to bottom: the cells are finer from there ({at}). {FINER}."
     versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     table = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
     table["text"] = SURE
     write_page(
         path,
         title=f"ddrecon: {path.absolute().parent.name}",
-        lead=_lead(scene, summary),
+        lead=lead,
         goes_on=summary["ended"]["kind"] == GOES_ON["kind"],
         doubts=[diagnosis["text"] for diagnosis in summary["diagnoses"]],
-        volume=describe_findings(findings, summary),
-        plots={"heading": "Loss", "drawn": curves(rows), "text": _explain_steps(rows)},
-        views=describe_views(findings),
+        volume=describe_fields(scene, fields, left_out),
+        plots={"heading": "Loss", "drawn": curves(rows, steps), "text": finer if steps else ""},
+        views=_describe_views(findings),
         numbers=table if numbers else None,
         physics=needed_terms(scene),
         settings=path.with_name("scene.yaml").read_text(encoding="utf-8"),
@@ -84,38 +99,28 @@ def list_numbers(
     The value of a pose is how far the camera of `scene` is moved and turned from `old_scene`.
     """
     rows = []
-    for parameter in parameters:
-        start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
-        if parameter.key == "camera" and parameter.view is not None:
-            old, new = (world.view(parameter.view).camera for world in (old_scene, scene))
+    for p in parameters:
+        start, value = (x.detach().double().flatten() for x in (p.start, p.value))
+        if p.key == "camera" and p.view is not None:
+            old, new = (world.view(p.view).camera for world in (old_scene, scene))
             moved = shift_between(old, new, scene.volume)
             apart = float((new.pose - old.pose)[:, :3].norm())  # sqrt(8) sin(angle / 2)
             turned = math.degrees(2 * math.asin(min(1.0, apart / math.sqrt(8))))
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
-            rows.append((parameter.name, "as given", text))
-        elif not parameter.is_field and len(value) <= LISTED:
-            rows.append((parameter.name, *_tell_change(start, value, parameter.key == "direction")))
+            rows.append((p.name, "as given", text))
+        elif not p.is_field and len(value) <= LISTED:
+            pairs = list(zip(start.tolist(), value.tolist(), strict=True))
+            if p.key == "direction":
+                cosine = torch.nn.functional.cosine_similarity(start, value, dim=0)
+                turned = math.degrees(math.acos(min(1.0, float(cosine))))
+                text = ", ".join(f"{y:.4g}" for _, y in pairs)
+                text += f" (turned by {turned:.2g} degrees)"
+            else:
+                changes = [f" ({y / x - 1:+.1%})" if x else "" for x, y in pairs]
+                ends = zip(pairs, changes, strict=True)
+                text = ", ".join(f"{y:.4g}{change}" for (_, y), change in ends)
+            rows.append((p.name, ", ".join(f"{x:.4g}" for x, _ in pairs), text))
     return rows
-
-
-def _tell_change(start: Tensor, value: Tensor, is_direction: bool) -> tuple[str, str]:
-    """The numbers `start` [n], and those found, with their changes: parts of them, or an angle."""
-    pairs = list(zip(start.tolist(), value.tolist(), strict=True))
-    changes = ["" if is_direction or not x else f" ({y / x - 1:+.1%})" for x, y in pairs]
-    end = ", ".join(f"{y:.4g}{text}" for (_, y), text in zip(pairs, changes, strict=True))
-    if is_direction:
-        apart = float(torch.nn.functional.cosine_similarity(start.double(), value.double(), dim=0))
-        end += f" (turned by {math.degrees(math.acos(min(1.0, apart))):.2g} degrees)"
-    return ", ".join(f"{x:.4g}" for x in start.tolist()), end
-
-
-def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
-    cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
-    return (
-        f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"{psnr_text(summary)}; all compare {summary['compared']}. "
-        f"The loss is {summary['loss_function']}. It {summary['ended']['text']}."
-    )
 
 
 def psnr_text(summary: Mapping[str, Any]) -> str:
@@ -124,105 +129,67 @@ def psnr_text(summary: Mapping[str, Any]) -> str:
     if summary.get("test_psnr") is not None:
         text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
     if registered := summary.get("registered"):
-        text += f" (registered {registered_text(registered)})"
+        text += f" (registered {_registered_text(registered)})"
     return text
 
 
-def describe_findings(findings: Findings, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Every field that was found, and beside it what the scene file has in its place.
-
-    And what of the volume the `summary` says was left out.
-    """
-    left_out = list[str]()
-    if "support" in summary:
-        share = 100 * (1 - summary["support"]["cells"])
-        left_out = [f"Left out by the support: {share:.3g} % of the cells."]
-    kinds = {"result": fields_of(findings.scene), "truth": findings.truths}
-    return describe_fields(findings.scene, kinds, left_out)
-
-
 def describe_fields(
-    scene: Scene,
-    kinds: Mapping[str, Mapping[str, Tensor]],
-    lines: Sequence[str] = (),
-    shown: str = "density",
+    scene: Scene, fields: Sequence[Field], lines: Sequence[str] = (), shown: str = "density"
 ) -> dict[str, Any]:
-    """The section of a page with fields on the grid of `scene`, by kind and name.
+    """The section of a page with `fields` on the grid of `scene`; those of one name have one scale.
 
-    Those of one name have one scale.
+    There are `lines` about them, and the field called `shown` is seen first.
     """
     whites = dict[str, float]()
-    for name, value in ((n, v) for values in kinds.values() for n, v in values.items()):
-        whites[name] = max(whites.get(name, 0.0), find_white_value(value))
-    fields = [
-        Shown(name, of, value, whites[name])
-        for of, values in kinds.items()
-        for name, value in values.items()
-    ]
-    return describe_volume(fields, describe_world(scene.volume.grid, scene), lines, shown)
+    for name, _, values, _ in fields:
+        whites[name] = max(whites.get(name, 0.0), find_white_value(values))
+    scaled = [Shown(name, of, values, whites[name], frame) for name, of, values, frame in fields]
+    return describe_volume(scaled, describe_world(scene.volume.grid, scene), lines, shown)
 
 
-def curves(rows: Sequence[Row]) -> list[Plot]:
-    """Loss and PSNR by iteration."""
-    losses = {
-        "images": [(float(row.iteration), row.data_loss) for row in rows],
-        "penalties": [(float(row.iteration), row.penalty) for row in rows],
-    }
-    quality = {"trained on": [(float(row.iteration), row.psnr) for row in rows]}
-    tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
-    if tests:
-        quality["held out"] = tests
-    steps = [float(row.iteration) for row in _steps(rows)]
-    return [
-        draw_curve("loss", losses, "iteration", is_logarithmic=True, steps=steps),
-        draw_curve("PSNR [dB]", quality, "iteration", steps=steps),
-    ]
+def curves(rows: Sequence[Row], steps: Sequence[Row] = ()) -> list[Plot]:
+    """Loss and PSNR by iteration; `steps` are the first rows of finer cells."""
+    columns = {"images": "data_loss", "penalties": "penalty"}, {"trained on": "psnr"}
+    if any(row.test_psnr is not None for row in rows):
+        columns[1]["held out"] = "test_psnr"
+    marks, plots = [float(row.iteration) for row in steps], list[Plot]()
+    for title, names in zip(("loss", "PSNR [dB]"), columns, strict=True):
+        series = {
+            name: [(float(r.iteration), y) for r in rows if (y := getattr(r, key)) is not None]
+            for name, key in names.items()
+        }
+        is_loss = title == "loss"
+        plots.append(draw_curve(title, series, "iteration", is_logarithmic=is_loss, steps=marks))
+    return plots
 
 
-def _steps(rows: Sequence[Row]) -> list[Row]:
-    """The first row of each resolution but the first."""
-    return [row for previous, row in pairwise(rows) if row.cells != previous.cells]
-
-
-def _explain_steps(rows: Sequence[Row]) -> str:
-    at = ", ".join(str(row.iteration) for row in _steps(rows))
-    return at and f"A line from top to bottom: the cells are finer from there ({at}). {FINER}."
-
-
-def describe_views(findings: Findings) -> dict[str, Any]:
+def _describe_views(findings: Findings) -> dict[str, Any]:
     """Target and render of the first views, those held out first, and a table of all."""
-    views = [view for view in findings.scene.views if view.image is not None]
+    views = findings.seen
     shown = sorted(views, key=lambda view: not view.is_test)[:SHOWN]
     white = median(find_white(pixels(target_of(view))) for view in shown)
     most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
-    labels = {"Held out": True, "Trained on": False}
-    groups = {
-        label: [_figure(findings, v, white, most) for v in shown if v.is_test == is_test]
-        for label, is_test in labels.items()
-    }
+    groups: dict[str, list[tuple[bytes, bytes, str]]] = {"Held out": [], "Trained on": []}
+    for view in shown:
+        target, render = (
+            webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
+            for image in (target_of(view), findings.images[view.name])
+        )
+        caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
+        groups["Held out" if view.is_test else "Trained on"].append((target, render, caption))
+    rows = []
+    for view in findings.scene.views:
+        height, width = view.camera.size
+        quality = findings.quality.get(view.name)
+        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        split = "test" if view.is_test else "train"
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
     return {
         "white": f"{white:.3g}",
         "groups": [(label, figures) for label, figures in groups.items() if figures],
         "more": len(views) - len(shown),
-        "rows": [_describe_view(findings, view) for view in findings.scene.views],
+        "rows": rows,
     }
-
-
-def _figure(findings: Findings, view: View, white: float, most: int) -> tuple[bytes, bytes, str]:
-    """Target, render and caption."""
-    target, render = (
-        webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
-        for image in (target_of(view), findings.images[view.name])
-    )
-    return target, render, f"{view.name}: {_quality_text(findings.quality[view.name])}"
-
-
-def _describe_view(findings: Findings, view: View) -> tuple[str, ...]:
-    height, width = view.camera.size
-    split = "test" if view.is_test else "train"
-    quality = findings.quality.get(view.name)
-    shown = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
-    return view.name, split, f"{width} x {height}", f"{view.weight:g}", *shown
 
 
 def _quality_text(quality: Mapping[str, Any]) -> str:
@@ -232,12 +199,11 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
         if f"fitted_{key}" in quality:
             values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
             text += f", {key} {values} fitted to it"
-    if registered := quality.get("registered"):
-        text += f"; registered {registered_text(registered)}"
-    return text
+    registered = quality.get("registered")
+    return text + (f"; registered {_registered_text(registered)}" if registered else "")
 
 
-def registered_text(registered: Mapping[str, float]) -> str:
+def _registered_text(registered: Mapping[str, float]) -> str:
     """How good a view held out is by a camera fitted to the volume, and how far that moved."""
     psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
     return f"{psnr:.2f} dB, SSIM {ssim:.4f}, smoke moved by {shift:.2f} pixels"

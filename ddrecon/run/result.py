@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ddrecon.errors import UsageError
 from ddrecon.scene_file.load import SceneFile, describe
 from ddrecon.settings import LENSES
-from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, is_of_volume, split_name
+from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, split_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -89,47 +89,44 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
 
     A field is `{file: ...}`, a map the name of its file, a camera `{matrix: ...}`.
     """
+    views = {f"views.{view['name']}": view for view in described["views"]}
     media = {"": described["volume"]} | {
         f"media.{name}.": section for name, section in described["volume"].get("media", {}).items()
     }
-    for medium, section in media.items():
-        of_medium = {
-            split_name(name)[1]: value
-            for name, value in values.items()
-            if is_of_volume(name) and split_name(name)[0] == medium
-        }
-        _put_medium(section, of_medium)
-    # The lights, an attribute at a time: `lights.0.irradiance`.
     for name, value in values.items():
-        if name.startswith("lights."):
-            _, index, attribute = name.split(".")
-            described["lights"][int(index)]["file" if isinstance(value, str) else attribute] = value
-    if "ground.albedo" in values:
-        albedo = values["ground.albedo"]
-        described["ground"]["albedo"] = {"file": albedo} if isinstance(albedo, str) else albedo
-    for section in described["views"]:
-        camera, owner = section["camera"], f"views.{section['name']}."
-        attributes = {n.removeprefix(owner): v for n, v in values.items() if n.startswith(owner)}
-        if "camera" in attributes:
-            for key in ("origin", "target", "up"):
-                camera.pop(key, None)
-            camera |= attributes["camera"]
-        if "focal" in attributes:
-            camera["fov"] = 2 * math.degrees(math.atan(0.5 / attributes["focal"]))
-        if "principal_point" in attributes:
-            camera["principal_point"] = attributes["principal_point"]
-        if "distortion" in attributes:
-            model = camera["distortion"]["type"]
-            coefficients = zip(LENSES[model], attributes["distortion"], strict=True)
-            camera["distortion"] = {"type": model} | dict(coefficients)
-        section.update({key: attributes[key] for key in RESPONSE if key in attributes})
+        owner, _, key = name.rpartition(".")
+        if owner in views:
+            _put_view(views[owner], key, value)
+        elif name.startswith("lights."):
+            light = described["lights"][int(owner.removeprefix("lights."))]
+            light["file" if isinstance(value, str) else key] = value
+        elif name == "ground.albedo":
+            described["ground"]["albedo"] = {"file": value} if isinstance(value, str) else value
+        else:
+            medium, key = split_name(name)
+            section = media[medium]
+            for pair in PAIRS:  # one of them replaces the other
+                if key in (*PAIRS[0], *PAIRS[1]) and key not in pair:
+                    for other in pair:
+                        section.pop(other, None)
+            is_angular = key == "g" or key.startswith(PHASE)
+            section = section.get("phase", section) if is_angular else section
+            section[key.removeprefix(PHASE)] = value
 
 
-def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:
-    if any(set(pair) & set(values) for pair in PAIRS):
-        for name in (*PAIRS[0], *PAIRS[1]):
-            section.pop(name, None)
-    for name, value in values.items():
-        is_angular = name == "g" or name.startswith(PHASE)
-        owner = section.get("phase", section) if is_angular else section
-        owner[name.removeprefix(PHASE)] = value
+def _put_view(section: dict[str, Any], key: str, value: Any) -> None:
+    camera = section["camera"]
+    if key in RESPONSE:
+        section[key] = value
+    elif key == "camera":
+        for other in ("origin", "target", "up"):
+            camera.pop(other, None)
+        camera |= value
+    elif key == "focal":
+        camera["fov"] = 2 * math.degrees(math.atan(0.5 / value))
+    elif key == "principal_point":
+        camera["principal_point"] = value
+    elif key == "distortion":
+        model = camera["distortion"]["type"]
+        coefficients = zip(LENSES[model], value, strict=True)
+        camera["distortion"] = {"type": model} | dict(coefficients)

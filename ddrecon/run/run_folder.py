@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import csv
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import astuple, fields
 from pathlib import Path
 from statistics import mean
 from time import monotonic
@@ -12,21 +15,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import FormatError, UsageError, is_utf8
+from ddrecon.errors import DataWarning, FormatError, SceneError, UsageError, is_utf8
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import flush, refusals, write_json
+from ddrecon.io.files.atomic import flush, refusals, replace_file, write_json
+from ddrecon.io.files.folders import Folder
 from ddrecon.io.images.table import write_linear, write_preview
+from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import write_field
-from ddrecon.progress import Progress, say
+from ddrecon.progress import say, tell
+from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.support import describe_support
+from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.checkpoint import load_checkpoint, newest_checkpoint
-from ddrecon.run.diagnoses import diagnose
-from ddrecon.run.job import CHECKPOINTS, Iterations, restore
-from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import FINER, GOES_ON, list_numbers, write_run_report
+from ddrecon.run.job import CHECKPOINTS, Job, Told, fingerprint, load_checkpoint, restore
+from ddrecon.run.quality import Findings, describe_loss, diagnose, find_results, loss_text
+from ddrecon.run.report import FINER, GOES_ON, list_numbers, psnr_text, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
@@ -37,75 +40,96 @@ from ddrecon.scene_file.load import (
     referenced_files,
     scene_text,
 )
-from ddrecon.variables.kinds import (
-    EXTINCTION_AND_ALBEDO,
-    PHASE,
-    RESPONSE,
-    is_of_volume,
-    kind_of,
-    split_name,
-)
+from ddrecon.variables.kinds import CROSS_SECTIONS, PHASE, is_of_volume, kind_of, split_name
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
-SCENE = "scene.yaml"
-"""The resolved scene of a run."""
 PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
 """The report is written about this often, and takes at most this part of the run's time."""
-REPORT, SUMMARY = "report.html", "summary.json"
-"""The page of a run, and the file that is written last: a run that has it is finished."""
+SCENE, LOG, REPORT, SUMMARY = "scene.yaml", "loss.csv", "report.html", "summary.json"
+"""The resolved scene of a run, its log, its page, and the file that is written last: a run that has
+it is finished."""
+ROUNDING = 1e-6
+"""Relative rounding below which cells count as equal: one cross section follows from others."""
+LENGTHS = "sigma_t [1/u], where [u] is the unit of length of the grid"
+"""What a file says of the units of lengths; density times sigma_t is the extinction."""
 
 
-def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
-    """The run in `folder` as it was saved last; `build` makes its scene, of a precision.
+class Iterations(Job):
+    """The job of a `run`: that of a scene, or of several together."""
 
-    Raises UsageError where the folder holds no run, FormatError where it is damaged.
-    """
-    state, loaded = load_checkpoint(require_run(folder))
-    if "frames" not in state:
-        raise UsageError(f"{folder}: holds no run; name the folder that `ddrecon optimize` wrote")
-    run = Reconstruction(
-        build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
-    )
-    restore(run, state, loaded)
-    return run
+    def __init__(self, run: Reconstruction, title: str, result_of: Mapping[str, Any]):
+        self.run, self.title, self.result_of = run, title, result_of
+
+    @property
+    def iteration(self) -> int:
+        return self.run.iteration
+
+    @property
+    def total(self) -> int | None:
+        schedule = self.run.schedule
+        return None if schedule.is_auto else schedule.most
+
+    @property
+    def is_done(self) -> bool:
+        return self.run.is_done
+
+    def step(self) -> str:
+        return f"PSNR {mean(row.psnr for row in self.run.advance()):.1f} dB"
+
+    def state(self) -> dict[str, Any]:
+        return self.run.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.run.restore(state)
 
 
-def require_run(folder: Path) -> Path:
-    """The folder of checkpoints of the run in `folder`; raises UsageError where there is no run."""
-    checkpoints = folder / CHECKPOINTS
-    if not (folder / SCENE).is_file() or newest_checkpoint(checkpoints) is None:
-        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
-    return checkpoints
+class Run(Iterations):
+    """The job of reconstructing the `scene` of a `scene_file` in an `environment`.
 
-
-class RunFolder(Iterations):
-    """The job of a `run` of `scene_file` in an `environment`, and its folder, `path`.
-
-    Pictures are written each `preview_every` iterations; with `is_silent` nothing is told.
+    Pictures are written each `preview_every` iterations; a `frame` of a film, which this names,
+    says less. Raises SceneError for a scene that cannot be reconstructed.
     """
 
     def __init__(
         self,
-        run: Reconstruction,
-        path: Path,
+        scene: Scene,
         scene_file: SceneFile,
         environment: Mapping[str, Any],
         preview_every: int | None = None,
-        is_silent: bool = True,
+        frame: str = "",
     ):
-        super().__init__(run)
-        self.path, self.scene_file, self.environment = path, scene_file, environment
-        self.preview_every, self.is_silent, self.cells = preview_every, is_silent, 0
-        self.log = LossLog(path / "loss.csv")
+        try:
+            with tell(f"{frame or 'optimize'}: looking at what the pictures show"):
+                run = Reconstruction(scene)
+        except SceneError as error:
+            problems = [f"{scene_file.path}: {problem}" for problem in error.problems]
+            raise SceneError(problems) from None
+        result_of = fingerprint(scene_file, scene.volume.density.dtype)
+        super().__init__(run, frame or "optimize", result_of)
+        self.scene_file, self.environment, self.is_frame = scene_file, environment, bool(frame)
+        self.preview_every, self.cells = preview_every, 0
+        self.path: Path | None = None
         self.next_page = monotonic() + PAGE_SECONDS
 
-    def begin(self) -> None:
-        """Makes the folders, and cuts the log to end where the run does."""
+    def begin(self, folder: Folder, is_resumed: bool) -> None:
+        """Writes the scene to the folder; cuts the log to end where the run does."""
+        self.path, run = folder.path, self.run
+        if run.iteration > run.schedule.most:
+            advice = "ask for more than that, in all, with --iterations"
+            raise UsageError(f"{self.path}: {run.iteration} iterations are made already; {advice}")
+        write_scene(self.scene_file, self.path)
+        if not is_resumed:
+            inputs = referenced_files(self.scene_file)
+            folder.clear([self.scene_file.path, self.path / SCENE, *inputs])
         with refusals(self.path):
             for name in ("volumes", "previews"):
                 (self.path / name).mkdir(exist_ok=True)
         write_json(self.path / "environment.json", self.environment)
-        self.log.cut(self.iteration)
+        write_log(
+            self.path / LOG, [r for r in read_log(self.path / LOG) if r.iteration <= self.iteration]
+        )
+        if not self.is_frame:
+            say(loss_text(describe_loss(run.problem.settings, run.problem.train)))
 
     def step(self) -> str:
         """Makes an iteration and its row of the log; how near its pictures are.
@@ -113,96 +137,132 @@ class RunFolder(Iterations):
         Now and then it writes the report of the run so far.
         """
         row = self.run.step()
-        self.log.add(row)
-        if self.cells not in (0, row.cells):
-            text = f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}"
-            say(text, self.is_silent)
+        if self.path is None:
+            return ""
+        write_log(self.path / LOG, [row], is_more=True)
+        if self.cells not in (0, row.cells) and not self.is_frame:
+            say(f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}")
         self.cells = row.cells
         if self.preview_every and row.iteration % self.preview_every == 0:
-            self._pictures(find_results(self.run), f".{row.iteration:06d}")
+            write_previews(self.path, find_results(self.run), f".{row.iteration:06d}")
         start = monotonic()
         if start >= self.next_page and not self.is_done:
-            findings = find_results(self.run)
-            summary = _summary(self.run) | {"ended": GOES_ON, "diagnoses": []}
-            self._report(findings, summary)
-            seconds = monotonic() - start
-            self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
+            self._report(
+                find_results(self.run), self._summary() | {"ended": GOES_ON, "diagnoses": []}
+            )
+            self.next_page = monotonic() + max(PAGE_SECONDS, (monotonic() - start) / PAGE_SHARE)
         test_psnr = self.run.total.test_psnr
-        test = "" if test_psnr is None else f"/{test_psnr:.1f}"
-        return f"PSNR {row.psnr:.1f}{test} dB"
+        return f"PSNR {row.psnr:.1f}{'' if test_psnr is None else f'/{test_psnr:.1f}'} dB"
 
     def state(self) -> dict[str, Any]:
         """That of the run; the log has all rows that it counts."""
-        flush(self.log.path)
+        if self.path is not None:
+            flush(self.path / LOG)
         return super().state()
 
-    def _report(self, findings: Findings, summary: Mapping[str, Any]) -> None:
-        run, rows = self.run, self.log.rows(self.iteration)
-        numbers = list_numbers(run.parameters, run.problem.scene, findings.scene)
-        path = self.path / REPORT
-        write_run_report(path, findings, rows, summary, self.environment, numbers)
-
-    def finish(self, progress: Progress) -> dict[str, Any]:
-        """The summary of the run; writes it and volumes, parameters, result, pictures, report."""
-        run = self.run
-        findings = find_results(run, progress)
-        scene = findings.scene
+    def finish(self) -> Told:
+        """Writes volumes, parameters, result, pictures and report, and tells the summary."""
+        assert self.path is not None
+        run, path = self.run, self.path
+        findings = find_results(run, is_last=True)
+        scene, support = findings.scene, run.problem.support
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
-        values = {name: self._store(scene, name) for name in stored}
-        dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
-        write_json(self.path / "parameters.json", self._parameters(scene, values))
-        self._pictures(findings, "")
-        summary, support = _summary(run) | {"views": findings.quality}, run.problem.support
-        results = scene, findings.images, findings.quality
-        fall = run.iteration, run.search.gain
-        summary["diagnoses"] = diagnose(*results, *fall, support, summary.get("support"))
+        values = {name: store_value(path, scene, name) for name in stored}
+        dump_scene(describe_result(self.scene_file, scene, values), path / RESULT)
+        write_json(path / "parameters.json", _list_parameters(path, scene, values))
+        write_previews(path, findings, "")
+        summary = self._summary() | {"views": findings.quality}
         seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
             summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
+        fall, doubt = (run.iteration, run.search.gain), summary.get("support", {}).get("doubt")
+        summary["diagnoses"] = diagnose(findings, *fall, support, doubt)
         self._report(findings, summary)
-        write_json(self.path / SUMMARY, summary)
+        write_json(path / SUMMARY, summary)
+        lines = [
+            f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: loss "
+            f"{summary['loss']:.4g}, {psnr_text(summary)}, of {summary['compared']}"
+        ]
+        lines += [support_text(summary["support"])] if "support" in summary else []
+        lines += [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
+        return summary, [*lines, *(diagnosis["text"] for diagnosis in summary["diagnoses"])]
+
+    def _summary(self) -> dict[str, Any]:
+        problem, total = self.run.problem, dict(vars(self.run.total))
+        summary = {"iterations": total.pop("iteration"), **total}
+        summary |= describe_loss(problem.settings, problem.train)
+        if problem.loss == "photon":
+            summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
+        summary["ended"] = self.run.ending()
+        if problem.support is not None:
+            summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
         return summary
 
-    def _store(self, scene: Scene, name: str) -> Any:
-        """The value of a variable as plain numbers, or where its file is, which is written here."""
-        value = value_of(scene, name)
-        if value.ndim < 3:
-            return plain(value)
-        if not kind_of(name).is_cellwise:
-            return write_values(self.path / name, name, value, scene.volume.grid, is_map=True)
-        return {"file": write_volume(self.path, name, value, scene.volume.grid)}
+    def _report(self, findings: Findings, summary: Mapping[str, Any]) -> None:
+        assert self.path is not None
+        rows = [row for row in read_log(self.path / LOG) if row.iteration <= self.iteration]
+        if len(rows) < self.iteration:
+            text = f"{self.path / LOG}: has {len(rows)} of the {self.iteration} iterations made"
+            warnings.warn(text, DataWarning, 2)
+        numbers = list_numbers(self.run.parameters, self.run.problem.scene, findings.scene)
+        write_run_report(self.path / REPORT, findings, rows, summary, self.environment, numbers)
 
-    def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Everything of `scene` that is not a field, as plain values.
 
-        Maps become files of their own, but for those that are `stored`.
-        """
-        parameters: dict[str, Any] = {}
-        coefficients = "density", *EXTINCTION_AND_ALBEDO
-        for name in variable_names(scene):
-            is_light, value = name.startswith(("lights.", "ground.")), value_of(scene, name)
-            if is_light and value.ndim >= 3:
-                parameters[name] = stored.get(name) or self._store(scene, name)
-            elif is_light or (
-                is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
-            ):
-                parameters[name] = value.tolist()
-        parameters |= poses_of(scene, [f"views.{view.name}.camera" for view in scene.views])
-        for view in scene.views:
-            for key in RESPONSE:
-                if (value := getattr(view, key)) is not None:
-                    parameters[f"views.{view.name}.{key}"] = value.tolist()
-        return parameters
+def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
+    """The run in `folder` as it was saved last; `build` makes its scene, of a precision.
 
-    def _pictures(self, findings: Findings, mark: str) -> None:
-        folder = self.path / "previews"
-        for name, value in fields_of(findings.scene).items():
-            write_preview(folder / f"{name}.slices{mark}.png", slices(value))
-        for view in findings.scene.views:
-            if view.image is not None:
-                shown = comparison(view.image, findings.images[view.name])
-                write_preview(folder / f"{view.name}{mark}.png", shown)
+    Raises UsageError where the folder holds no run, FormatError where it is damaged.
+    """
+    if not (folder / SCENE).is_file() or not (folder / LOG).is_file():
+        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
+    state, loaded = load_checkpoint(folder / CHECKPOINTS)
+    run = Reconstruction(
+        build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
+    )
+    restore(run, state, loaded)
+    return run
+
+
+def read_log(path: Path) -> list[Row]:
+    """The readable rows of the log at `path`."""
+    try:
+        _, *lines = path.read_text(errors="replace").splitlines() or [""]
+    except OSError:
+        return []
+    return [row for row in map(_read_row, lines) if row is not None]
+
+
+def _read_row(line: str) -> Row | None:
+    """What `line` says; None where it is not whole, or no number stands where one should."""
+    read: dict[Any, Any] = {"int": int, "float": float}
+    read["float | None"] = lambda cell: float(cell) if cell else None
+    try:
+        cells = zip(fields(Row), line.split(","), strict=True)
+        return Row(*(read[column.type](cell) for column, cell in cells))
+    except ValueError:
+        return None
+
+
+def write_log(path: Path, rows: Iterable[Row], is_more: bool = False) -> None:
+    """Writes the log of `rows` to `path`, or adds them to what is there where they are more."""
+    cells = [[f"{x:.8g}" if isinstance(x, float) else x for x in astuple(row)] for row in rows]
+    if is_more:
+        with refusals(path), path.open("a", newline="") as stream:
+            csv.writer(stream).writerows(cells)
+        return
+    with replace_file(path) as temporary, temporary.open("w", newline="") as stream:
+        csv.writer(stream).writerows([[column.name for column in fields(Row)], *cells])
+
+
+def write_previews(folder: Path, findings: Findings, mark: str) -> None:
+    """Writes middle slices of fields, and views beside their targets, to previews/NAMEmark.png."""
+    for name, value in fields_of(findings.scene).items():
+        write_preview(folder / "previews" / f"{name}.slices{mark}.png", slices(value))
+    for view in findings.seen:
+        assert view.image is not None
+        shown = comparison(view.image, findings.images[view.name])
+        write_preview(folder / "previews" / f"{view.name}{mark}.png", shown)
 
 
 def write_scene(scene_file: SceneFile, folder: Path) -> None:
@@ -220,6 +280,31 @@ def write_scene(scene_file: SceneFile, folder: Path) -> None:
         if text != scene_text(describe(read_scene(path))):
             raise UsageError(f"{path}: was changed and would be replaced; name a copy elsewhere")
     dump_scene(describe(scene_file), path)
+
+
+def _list_parameters(folder: Path, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything of `scene` that is not a field, as plain values.
+
+    Maps become files of their own, but for those that are `stored`.
+    """
+    parameters = dict[str, Any]()
+    for name in variable_names(scene):
+        value = value_of(scene, name)
+        if value.ndim < 3:
+            parameters[name] = value.tolist()
+        elif not kind_of(name).is_cellwise:
+            parameters[name] = stored.get(name) or store_value(folder, scene, name)
+    return parameters | poses_of(scene, parameters)
+
+
+def store_value(folder: Path, scene: Scene, name: str) -> Any:
+    """The value of a variable as plain numbers, or where its file is, which is written here."""
+    value = value_of(scene, name)
+    if value.ndim < 3:
+        return plain(value)
+    if not kind_of(name).is_cellwise:
+        return write_values(folder / name, name, value, scene.volume.grid, is_map=True)
+    return {"file": write_volume(folder, name, value, scene.volume.grid)}
 
 
 def field_key(name: str) -> str:
@@ -249,18 +334,34 @@ def write_values(stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool =
         write_linear(stem, value.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
         return f"{stem.name}.npy"
     file, box = stem.with_name(f"{stem.name}.npz"), np.array(grid.bounds_xyz)
-    array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-    write_field(file, key, array.float().cpu().numpy(), box)
+    write_field(file, key, _channels_last(value), box)
     return file.name
 
 
-def _summary(run: Reconstruction) -> dict[str, Any]:
-    problem, total = run.problem, dict(vars(run.total))
-    summary = {"iterations": total.pop("iteration"), **total}
-    summary |= describe_loss(problem.settings, problem.train)
-    if problem.loss == "photon":
-        summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
-    summary["ended"] = run.ending()
-    if problem.support is not None:
-        summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
-    return summary
+def _channels_last(value: Tensor) -> np.ndarray:
+    """A field [z, y, x] or [C, z, y, x] as files have it: [z, y, x] or [z, y, x, 3]."""
+    array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+    return array.detach().float().cpu().numpy()
+
+
+def fields_to_export(scene: Scene) -> tuple[dict[str, np.ndarray], Fields, np.ndarray]:
+    """What differs from cell to cell, what is the same everywhere, and the box, of `scene`.
+
+    Density is always among the first; of cross sections there are sigma_t and albedo, which
+    programs of film and games take. Fields are [z, y, x] or [z, y, x, 3], constants have one number
+    or three, and the box [2, 3] is its corners (x, y, z).
+    """
+    varied, constants = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    for name in variable_names(scene):
+        if not is_of_volume(name) or name in CROSS_SECTIONS:
+            continue
+        value = value_of(scene, name).detach().float().cpu()
+        if value.ndim >= 3:
+            low, high = value.flatten(-3).aminmax(dim=-1)
+            if split_name(name)[1] == "density" or (high - low > ROUNDING * high.abs()).any():
+                varied[name] = _channels_last(value)
+                continue
+            value = (low + high) / 2
+        if value.numel() in (1, 3):
+            constants[name] = value.numpy()
+    return varied, constants, np.array(scene.volume.grid.bounds_xyz)

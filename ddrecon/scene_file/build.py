@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import (
+    BRIGHTNESS,
     AmbientLight,
     BeamLight,
     DirectionalLight,
@@ -27,20 +28,18 @@ from ddrecon.light.lights import (
     PointLight,
 )
 from ddrecon.march.windows import look_inside
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
-from ddrecon.medium.phase_blend import Blend
+from ddrecon.medium.coefficients import Volume, mix_media
+from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
 from ddrecon.scene import Scene, View
-from ddrecon.scene_file.build_views import build_views
+from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
-from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     AmbientSection,
     BeamSection,
     DirectionalSection,
+    EnvironmentSection,
     GroundSection,
     LightSection,
     PointSection,
@@ -50,13 +49,19 @@ from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
     component_names,
+    find_volume_readers,
     name_each,
     value_of,
     variable_names,
-    volume_names,
-    volume_value,
 )
 
+LIGHTS: dict[type, Callable[..., Light]] = {
+    DirectionalSection: DirectionalLight,
+    AmbientSection: AmbientLight,
+    PointSection: PointLight,
+    BeamSection: BeamLight,
+}
+"""What each section of a light becomes; keys have the same names in both."""
 START_OF_EMISSION = 0.1
 """Emission optimized from nothing shows so many times the pictures' brightness."""
 
@@ -161,24 +166,16 @@ def _build_parts(
 
 def _build_light(maker: Maker, owner: str, section: LightSection) -> Light:
     """The light of `section`, whose variables begin with `owner`."""
-    tensor, color = maker.tensor, maker.color
-    match section:
-        case DirectionalSection():
-            irradiance = color(f"{owner}irradiance", section.irradiance)
-            return DirectionalLight(tensor(section.direction), irradiance)
-        case AmbientSection():
-            return AmbientLight(color(f"{owner}radiance", section.radiance))
-        case PointSection():
-            intensity = color(f"{owner}intensity", section.intensity)
-            return PointLight(tensor(section.position), intensity)
-        case BeamSection():
-            ray = tensor(section.position), tensor(section.direction)
-            power = color(f"{owner}power", section.power)
-            return BeamLight(*ray, power, tensor(section.radius))
+    if not isinstance(section, EnvironmentSection):
+        numbers = {
+            key: maker.color(owner + key, value) if key in BRIGHTNESS else maker.tensor(value)
+            for key, value in vars(section).items()
+        }
+        return LIGHTS[type(section)](**numbers)
     pixels = read_referenced(maker.scene_file, f"{owner}file", section.file, _read_map)
     radiance = _map_of(maker, f"{owner}radiance", pixels)
-    numbers = tensor(section.scale), tensor(section.rotation)
-    return EnvironmentLight(radiance, *numbers, section.directions, section.up)
+    scale, rotation = maker.tensor(section.scale), maker.tensor(section.rotation)
+    return EnvironmentLight(radiance, scale, rotation, section.directions, section.up)
 
 
 def _map_of(maker: Maker, name: str, pixels: np.ndarray) -> Tensor:
@@ -262,9 +259,9 @@ def _varied(
     """How many numbers a cell the parameter `name` has."""
     (owner, last), kind = split_name(name), kind_of(name)
     medium = media.get(owner.removeprefix("media.").strip("."))
-    if medium is None or not kind.is_cellwise or last not in volume_names(medium):
+    if medium is None or not kind.is_cellwise or last not in (read := find_volume_readers(medium)):
         return 0
-    value = volume_value(medium, last)
+    value = read[last]()
     is_field = value.ndim >= 3 or isinstance(settings.init, FieldFile)
     is_field = is_field or (last == "emission" and _is_dark(value))
     is_field = is_field if settings.field is None else settings.field
@@ -272,30 +269,40 @@ def _varied(
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
-    key = f"optimize.parameters.{name}"
+    key, cells = f"optimize.parameters.{name}", scene.volume.grid.shape
     try:
         value = value_of(scene, name).clone()
     except UsageError:
-        raise scene_file.refused(
-            key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
-        ) from None
-    kind = kind_of(name)
+        fault = f"the scene has no such number{suggestion(name, variable_names(scene))}"
+        raise scene_file.refused(key, fault) from None
+    kind, init, is_field = kind_of(name), settings.init, settings.field
     if name == "emission" and _is_dark(value):
         # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.
         value = torch.full_like(value, START_OF_EMISSION * unit_of(scene, name))
-        settings = replace(settings, field=settings.field is not False)
-    if isinstance(settings.init, FieldFile):
+        is_field = is_field is not False
+    if isinstance(init, FieldFile):
         if not kind.is_cellwise:
             raise scene_file.refused(f"{key}.init.file", f"{name} is not a field: give its numbers")
-        called = settings.init.name or split_name(name)[1].removeprefix(PHASE)
+        called = init.name or split_name(name)[1].removeprefix(PHASE)
         read = partial(read_quantity, name=name, called=called)
-        field = read_referenced(scene_file, f"{key}.init.file", settings.init.file, read)
-        cells = cells_of(field).to(value)
-        value = cells if kind.is_color else cells[0]
-    elif settings.init is not None:
-        value = _fill(scene_file, f"{key}.init", name, settings.init, value)
-    if kind.is_cellwise:
-        value = _spread(scene_file, key, settings, value, scene.volume.grid.shape)
+        field = cells_of(read_referenced(scene_file, f"{key}.init.file", init.file, read)).to(value)
+        if tuple(field.shape[-3:]) != cells:
+            fault = (
+                f"has {list(field.shape[-3:])} cells [z, y, x], but the volume has {list(cells)}"
+            )
+            raise scene_file.refused(f"{key}.init.file", fault)
+        value = field if kind.is_color else field[0]
+    elif init is not None:
+        value = _fill(scene_file, f"{key}.init", name, init, value)
+    if kind.is_cellwise and is_field is not None and is_field != (value.ndim >= 3):
+        if is_field:
+            value = value.view(*value.shape, 1, 1, 1).expand(*value.shape, *cells).clone()
+        else:
+            value, high = value.flatten(-3).aminmax(dim=-1)
+            if not torch.equal(value, high):
+                advice = "give init: number, or leave field: false out"
+                fault = f"differs from cell to cell where it starts; {advice}"
+                raise scene_file.refused(key, fault)
     if not kind.allows(value):
         raise scene_file.refused(f"{key}.init", f"must be {kind.limits} everywhere")
     return value
@@ -323,31 +330,3 @@ def _fill(
     expected += " or [r, g, b]" if kind.is_color else ""
     length = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
     raise scene_file.refused(key, f"expected {expected}{length}")
-
-
-def _spread(
-    scene_file: SceneFile,
-    key: str,
-    settings: ParameterSettings,
-    value: Tensor,
-    shape: tuple[int, int, int],
-) -> Tensor:
-    """`value` as a field of `shape`, or as one number (a color), as the scene asks for."""
-    is_field = value.ndim >= 3
-    if is_field and tuple(value.shape[-3:]) != shape:
-        raise scene_file.refused(
-            f"{key}.init.file",
-            f"has {list(value.shape[-3:])} cells [z, y, x], but the volume has {list(shape)}",
-        )
-    if settings.field is None or settings.field == is_field:
-        return value
-    if settings.field:
-        return value.view(*value.shape, 1, 1, 1).expand(*value.shape, *shape).clone()
-    low, high = value.flatten(-3).aminmax(dim=-1)
-    if not torch.equal(low, high):
-        raise scene_file.refused(
-            key,
-            "differs from cell to cell where it starts;"
-            " give init: number, or leave field: false out",
-        )
-    return low

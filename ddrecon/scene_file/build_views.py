@@ -1,16 +1,21 @@
-"""The views section as cameras and target images; why a camera sees nothing of the volume."""
+"""The views section as cameras and pictures, frame by frame, and the box that fits them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, replace
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
+from statistics import mean
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import (
+    CELL,
     Camera,
     cast_rays,
     edge_places,
@@ -19,16 +24,24 @@ from ddrecon.cameras import (
     pixel_width,
     project,
 )
-from ddrecon.errors import FormatError, Problems
+from ddrecon.errors import DataWarning, FormatError, Problems
 from ddrecon.grid import Grid
+from ddrecon.hull import HullError, bound_smoke, find_shown
+from ddrecon.io.images.films import FILMS, frame_times, nearest_frame
 from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.lenses import distort, ray_through
 from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.maker import Maker
-from ddrecon.scene_file.view_schema import CameraSection, PerspectiveSection, ViewSection
+from ddrecon.scene_file.schema import Bounds, SceneTree
+from ddrecon.scene_file.view_schema import (
+    FRAME,
+    CameraSection,
+    PerspectiveSection,
+    ViewSection,
+)
+from ddrecon.settings import AUTO, ParameterSettings
 
 READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "image": read_image,
@@ -37,13 +50,39 @@ READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
 }
 """What reads the pictures of a view, by their keys."""
 SAME_UNIT = "are volume.bounds and the cameras in the same unit?"
-USUAL = 0.3, 10.0
-"""Pictures are so many times as wide as the box where cameras have its unit."""
 CHECKED = 1000
 """Within an image, distortion is checked at so many places; and at all of its edges."""
 COARSER = 8
 MOST_PIXELS = 2**18
 """Images are made about this small before they are looked at closely."""
+MANY_CELLS = 2**22
+"""More cells than these take hours."""
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes tensors of `dtype` on `device` of what `scene_file` says."""
+
+    scene_file: SceneFile
+    dtype: torch.dtype = torch.float32
+    device: torch.device | str = "cpu"
+
+    @property
+    def tree(self) -> SceneTree:
+        """The content of the scene file."""
+        return self.scene_file.tree
+
+    def tensor(self, value: Any) -> Tensor:
+        """`value`, numbers or a tensor."""
+        return torch.as_tensor(value, dtype=self.dtype, device=self.device)
+
+    def color(self, name: str, value: Any) -> Tensor:
+        """The color `value` of the variable `name`, [1] or [3]; three equal ones are one."""
+        return self.tensor(self.tree.share_color(name, value)).view(-1)
+
+    def picture(self, pixels: np.ndarray) -> Tensor:
+        """[C, h, w] of `pixels` [h, w, C]."""
+        return self.tensor(torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
 
 
 def build_views(maker: Maker, grid: Grid | None) -> list[View]:
@@ -206,15 +245,12 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
 
     Others may see it by chance.
     """
-    unit = _explain_unit(cameras, grid)
     if all(_looks_at(camera, grid) for camera in blind):
-        return f"it is in the picture, but smaller than a pixel: {unit or SAME_UNIT}"
+        return f"it is in the picture, but smaller than a pixel: {SAME_UNIT}"
     for convention, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
         turned = [replace(camera, pose=convert(camera.pose)) for camera in cameras]
         if all(_looks_at(camera, grid) for camera in turned):
             return f"it would with matrices read otherwise; they seem to be {convention}"
-    if unit:
-        return unit
     pose = blind[0].pose.double()
     is_behind = torch.dot(pose.new_tensor(grid.center_xyz) - pose[:, 3], -pose[:, 2]) < 0
     return (
@@ -222,21 +258,6 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
         " view or width, and that volume.bounds has the units and axes of the cameras, whose"
         " matrices are camera to world with x right, y up and z backward (OpenGL's axes)"
     )
-
-
-def _explain_unit(cameras: Sequence[Camera], grid: Grid) -> str:
-    """By which factor on lengths all `cameras` would see the box at a usual size, if by any."""
-    fits, middle = list[tuple[float, float]](), cameras[0].pose.new_tensor(grid.center_xyz)
-    for times in (10.0**power for power in (-3, -2, -1, 1, 2, 3)):
-        scale = middle.new_tensor([1, 1, 1, times])
-        scaled = [replace(camera, pose=camera.pose * scale) for camera in cameras]
-        widths = [pixel_width(c, middle) * c.size[1] for c in scaled if _looks_at(c, grid)]
-        least, most = (end(widths, default=1.0) / math.dist(*grid.bounds_xyz) for end in (min, max))
-        if len(widths) == len(cameras) and USUAL[0] < least <= most < USUAL[1]:
-            fits.append((abs(math.log(least * most)), times))
-    if not fits:
-        return ""
-    return f"it would be seen with lengths of the cameras times {min(fits)[1]:g}: {SAME_UNIT}"
 
 
 def _inverse(pose: Tensor) -> Tensor:
@@ -250,3 +271,133 @@ def _looks_at(camera: Camera, grid: Grid) -> bool:
     (column, row), _ = (values[0] for values in project(camera, center))
     height, width = camera.size
     return bool((column >= 0) & (column <= width) & (row >= 0) & (row <= height))
+
+
+def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
+    """The scene of the frame `number` of a film."""
+
+    def of_frame(view: ViewSection) -> ViewSection:
+        frame = number + view.frame
+
+        def name(path: Path | None) -> Path | None:
+            return path and Path(FRAME.sub(lambda field: field[0].format(frame=frame), str(path)))
+
+        return replace(view, image=name(view.image), mask=name(view.mask), frame=frame)
+
+    tree = scene_file.tree
+    views = tuple(map(of_frame, tree.views))
+    return replace(scene_file, tree=replace(tree, views=views, frames=None))
+
+
+def each_frame(scene_file: SceneFile) -> list[SceneFile]:
+    """The scenes of all frames of a film, or the scene itself."""
+    frames = scene_file.tree.frames
+    return [at_frame(scene_file, number) for number in frames.numbers] if frames else [scene_file]
+
+
+def require_frames(scene_file: SceneFile) -> None:
+    """Raises SceneError unless all pictures are there, and films have one rate.
+
+    FormatError for films that end before.
+    """
+    problems, frames = Problems(), each_frame(scene_file)
+    for frame in frames:
+        is_end = frame is frames[0] or frame is frames[-1]
+        for key, view, path in _pictures(frame):
+            if not problems.are_many:
+                with problems.collecting():
+                    require(frame, key, path)
+                    if is_end and path.suffix.lower() in FILMS:
+                        read_image(path, view.frame, view.time)
+    problems.raise_any()
+    _require_one_rate(scene_file)
+
+
+def _pictures(scene_file: SceneFile) -> Iterator[tuple[str, ViewSection, Path]]:
+    """The images and masks that the scene names: the key, the view and the path of each."""
+    for index, view in enumerate(scene_file.tree.views):
+        for key, path in (("image", view.image), ("mask", view.mask)):
+            if path is not None:
+                yield f"views.{index}.{key}", view, path
+
+
+def _require_one_rate(scene_file: SceneFile) -> None:
+    """Raises SceneError where films that are counted together do not show them together."""
+    paces = list[tuple[Path, float, list[float]]]()
+    numbers = scene_file.tree.frames.numbers if scene_file.tree.frames else ()
+    for key, view, path in _pictures(scene_file):
+        if not numbers or path.suffix.lower() not in FILMS:
+            continue
+        times = frame_times(path)
+        first = nearest_frame(times, view.time) + view.frame
+        rate = (len(times) - 1) / (times[-1] - times[0] or math.inf)
+        begin = times[first] if first >= 0 else times[0] + first / (rate or math.inf)
+        paces.append((path, rate, [times[first + number] - begin for number in numbers]))
+        film, usual, pace = paces[0]
+        apart = max(abs(a - b) for a, b in zip(pace, paces[-1][2], strict=True))
+        if apart * usual > 0.5 or (rate and usual and not 0.99 < rate / usual < 1.01):
+            fault = (
+                f"{path.name} has {rate:.5g} frames a second and {film.name} {usual:.5g}: "
+                f"frames of the same number come to be {apart:.2g} s apart; give films of one "
+                f"constant rate (ffmpeg -i {path.name} -r {usual:.5g} ...)"
+            )
+            raise scene_file.refused(key, fault)
+
+
+def fit_volume(scene_file: SceneFile) -> SceneFile:
+    """`scene_file` with its box and resolution in numbers; those of a film fit all of its frames.
+
+    Raises SceneError where the pictures do not tell, and what reading them raises.
+    """
+    tree = scene_file.tree
+    bounds, resolution = tree.volume.bounds, tree.volume.resolution
+    if bounds is None:
+        fault = "auto takes volume.bounds, a box in numbers or auto as well"
+        raise scene_file.refused("volume.resolution", fault)
+    if isinstance(bounds, Bounds):
+        corners = torch.tensor([bounds.min, bounds.max], dtype=torch.float64)
+    else:
+        corners = _find_box(scene_file)
+    middle, sides = corners.mean(0), corners[1] - corners[0]
+    if isinstance(resolution, str):
+        views = build_views(Maker(each_frame(scene_file)[0]), None)
+        cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
+        x, y, z = (max(1, math.ceil(side / cell)) for side in sides.tolist())
+        resolution = x, y, z
+        if x * y * z > MANY_CELLS:
+            times = math.ceil((x * y * z / MANY_CELLS) ** (1 / 3))
+            fewer = f"pictures {times} times smaller along each side make {times**3} times fewer"
+            fault = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
+            warnings.warn(f"volume.resolution: {fault}", DataWarning, 2)
+        sides = cell * sides.new_tensor(resolution)
+    if isinstance(bounds, Bounds):
+        # Other programs take cubes: the box grows upwards, to the right and backward for them.
+        grows = [name not in tree.volume.periodic for name in "xyz"]
+        ends = (corners[0] + sides).where(torch.tensor(grows), corners[1]).tolist()
+        bounds = Bounds(bounds.min, (ends[0], ends[1], ends[2]))
+    else:
+        digits = 3 - math.floor(math.log10(float(sides.max())))
+        low = [round(x, digits) for x in (middle - sides / 2).tolist()]
+        # Sides have more digits, or cells would be no cubes.
+        high = [round(x + side, digits + 5) for x, side in zip(low, sides.tolist(), strict=True)]
+        bounds = Bounds((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    volume = replace(tree.volume, bounds=bounds, resolution=resolution)
+    return replace(scene_file, tree=replace(tree, volume=volume))
+
+
+def _find_box(scene_file: SceneFile) -> Tensor:
+    """The corners [2, 3] of the box around all that the pictures may show."""
+    parameters = scene_file.tree.optimize.parameters if scene_file.tree.optimize else {}
+    density = parameters.get("density", ParameterSettings())
+
+    def frames() -> Iterator[tuple[Sequence[View], Sequence[Tensor]]]:
+        for frame in each_frame(scene_file):
+            built = build_views(Maker(frame), None)
+            views = [view for view in built if view.image is not None and not view.is_test]
+            yield views, [find_shown(view, density.support or AUTO) for view in views]
+
+    try:
+        return bound_smoke(frames(), density.margin)
+    except HullError as error:
+        fault = f"auto: {error}; or give min and max in numbers"
+        raise scene_file.refused("volume.bounds", fault) from error

@@ -16,28 +16,32 @@ from torch import Tensor
 from ddrecon.errors import DataWarning, FormatError, Problems, SceneError, UsageError, gather
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
-from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.field import GRAMS, KELVIN, MICROMETERS, Field, size_of
 from ddrecon.io.volumes.table import read_field
-from ddrecon.io.volumes.units import GRAMS, KELVIN, MICROMETERS, size_of
-from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mie import scatter_droplets
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.medium.phase_series import Tabulated
-from ddrecon.numerics.angle_table import at_even_angles
+from ddrecon.medium.optics import black_body_radiance, scatter_droplets
+from ddrecon.medium.phase import (
+    Blend,
+    HenyeyGreenstein,
+    PhaseFunction,
+    Rayleigh,
+    Tabulated,
+    TwoLobe,
+)
+from ddrecon.numerics.series import at_even_angles
+from ddrecon.scene_file.build_views import Maker
 from ddrecon.scene_file.load import SceneFile, read_referenced
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     Bounds,
+    ByHeight,
     ByLabel,
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
-    Profile,
     RayleighSection,
     TableSection,
     TwoLobeSection,
+    VolumeSection,
     Water,
 )
 from ddrecon.settings import FieldFile
@@ -70,7 +74,7 @@ def build_media(maker: Maker) -> dict[str, Volume]:
     gather(_Medium.read_fields, media.values())
     fields = dict(entry for medium in media.values() for entry in medium.fields.values())
     grid = _agree_on_grid(maker.scene_file, fields)
-    gather(lambda medium: medium.spread_profiles(grid), media.values())
+    gather(lambda medium: medium.spread_heights(grid), media.values())
     return {name: medium.build(grid) for name, medium in media.items()}
 
 
@@ -84,9 +88,10 @@ class _Medium:
     def __init__(self, maker: Maker, prefix: str, section: MediumSection):
         self.maker, self.prefix, self.section = maker, prefix, section
         self.fields: dict[str, tuple[str, Field]] = {}
-        names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
         self.quantities: dict[str, tuple[str, Any]] = {
-            name: (name, getattr(section, name)) for name in names
+            name: (name, getattr(section, name))
+            for name in (*FIELDS, "temperature")
+            if hasattr(section, name)
         }
         match phase := section.phase:
             case HenyeyGreensteinSection():
@@ -111,60 +116,58 @@ class _Medium:
     def read_field(self, variable: str) -> tuple[str, Field]:
         """The key at which the scene names the file of `variable`, and its content."""
         water, (name, value) = self.section.sigma_t, self.quantities[variable]
+        key = f"volume.{self.prefix}{name}"
         if isinstance(value, ByLabel):
-            return self.read_labels(variable, name, value)
+            read = partial(read_field, name=value.name)
+            labels = read_referenced(self.maker.scene_file, f"{key}.labels", value.labels, read)
+            return f"{key}.labels", self.look_up(variable, f"{name}.table", value, labels)
         called = value.name or variable.removeprefix(PHASE)
         is_free = variable == "density" and not isinstance(water, Water)
         unit = None if is_free else UNITS.get(variable)
         read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
-        key = f"volume.{self.prefix}{name}.file"
-        field = read_referenced(self.maker.scene_file, key, value.file, read)
+        field = read_referenced(self.maker.scene_file, f"{key}.file", value.file, read)
         if isinstance(water, Water) and field.meters not in (None, water.meters):
             fault = f"but u of {value.file.name} has {field.meters:g} m"
             raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
-        return key, field
+        return f"{key}.file", field
 
-    def read_labels(self, variable: str, name: str, value: ByLabel) -> tuple[str, Field]:
-        """The same where `value`, at the key `name`, gives `variable` by label."""
-        key = f"volume.{self.prefix}{name}."
-        read = partial(read_field, name=value.name)
-        field = read_referenced(self.maker.scene_file, f"{key}labels", value.labels, read)
-        by_label = self.known(variable, f"{name}.table", value.table)
+    def look_up(self, variable: str, key: str, by_label: ByLabel, field: Field) -> Field:
+        """`variable` in each cell by the table at `key`, of which `field` has the labels."""
+        table = self.table_of(variable, key, by_label.table)
         labels = field.values.astype(np.int64)
         if field.values.ndim != 3 or (labels != field.values).any() or labels.min() < 0:
-            raise FormatError(
-                value.labels, f"{value.name} are not whole numbers from 0, one a cell"
-            )
-        if labels.max() >= len(by_label):
-            fault = f"expected one for each label, {labels.max() + 1} with 0, found {len(by_label)}"
-            raise self.refused(f"{name}.table", fault)
-        return f"{key}labels", replace(field, values=by_label[labels].astype(np.float32))
+            fault = f"{by_label.name} are not whole numbers from 0, one a cell"
+            raise FormatError(by_label.labels, fault)
+        if labels.max() >= len(table):
+            fault = f"expected one for each label, {labels.max() + 1} with 0, found {len(table)}"
+            raise self.refused(key, fault)
+        return replace(field, values=table[labels].astype(np.float32))
 
-    def known(self, variable: str, key: str, values: Sequence[Any]) -> np.ndarray:
-        """`values` of `variable` at `key`, numbers or colors, as [n] or [n, 3]; else SceneError."""
-        kind, colors = kind_of(_kind_name(variable)), [np.ravel(color) for color in values]
+    def table_of(self, variable: str, key: str, rows: Sequence[Any]) -> np.ndarray:
+        """The `rows` of `variable` at `key`, numbers [n] or colors [n, 3]; else SceneError."""
+        kind, colors = kind_of(_kind_name(variable)), [np.ravel(row) for row in rows]
         if not kind.is_color and max(map(len, colors)) > 1:
             raise self.refused(key, "expected numbers: colors belong to the cross sections")
-        known = np.stack(np.broadcast_arrays(*colors))
-        if not kind.allows(torch.from_numpy(known)):
+        table = np.stack(np.broadcast_arrays(*colors))
+        if not kind.allows(torch.from_numpy(table)):
             raise self.refused(key, f"must be {kind.limits}")
-        return known.squeeze(1) if known.shape[1] == 1 else known
+        return table.squeeze(1) if table.shape[1] == 1 else table
 
-    def spread_profiles(self, grid: Grid) -> None:
+    def spread_heights(self, grid: Grid) -> None:
         """Evaluates the quantities that are given by height at the centers of cells of `grid`."""
         axis = "zyx".index(self.maker.tree.volume.up)
         centers = grid.lower[axis] + grid.spacing[axis] * (np.arange(grid.shape[axis]) + 0.5)
         for variable, (name, value) in self.quantities.items():
-            if not isinstance(value, Profile):
-                continue
-            key = f"{name}.values"
-            known = self.known(variable, key, value.values)
-            columns = np.atleast_2d(known.T)
-            column = np.stack([np.interp(centers, value.heights, color) for color in columns], -1)
-            sides = [size for side, size in enumerate(grid.shape) if side != axis]
-            cells = np.moveaxis(np.broadcast_to(column, (*sides, *column.shape)), 2, axis).copy()
-            field = Field(cells[..., 0] if known.ndim == 1 else cells)
-            self.fields[variable] = f"volume.{self.prefix}{key}", field
+            if isinstance(value, ByHeight):
+                key = f"{name}.values"
+                table = self.table_of(variable, key, value.values)
+                colors = [
+                    np.interp(centers, value.heights, color) for color in np.atleast_2d(table.T)
+                ]
+                column = np.stack(colors, -1) if table.ndim == 2 else colors[0]
+                ahead = column[(slice(None), *[None] * (2 - axis))]
+                cells = np.broadcast_to(ahead, (*grid.shape, *column.shape[1:])).copy()
+                self.fields[variable] = f"volume.{self.prefix}{key}", Field(cells)
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
@@ -189,16 +192,16 @@ class _Medium:
             tensor(sigma.expand(colors, *sigma.shape[1:]).contiguous()) for sigma in sigmas
         )
         density = tensor(self.values("density"))[0].expand(grid.shape)
-        emission = black_body = None
-        if self.maker.tree.glows and getattr(section, "temperature", None) is not None:
-            black_body = tensor(black_body_radiance(self.values("temperature")[0]))
-        elif self.maker.tree.glows and getattr(section, "emission", None) is not None:
-            emission = tensor(self.values("emission"))
-        elif not self.prefix and self.maker.tree.may_change("emission"):
-            emission = sigma_a.new_zeros(3)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
-        index = getattr(section, "index", 1.0)
-        return replace(medium, emission=emission, black_body=black_body, index=index)
+        medium.index = getattr(section, "index", 1.0)
+        if isinstance(section, VolumeSection) and self.maker.tree.glows:
+            if section.temperature is not None:
+                medium.black_body = tensor(black_body_radiance(self.values("temperature")[0]))
+            else:
+                medium.emission = tensor(
+                    sigma_a.new_zeros(3) if section.emission is None else self.values("emission")
+                )
+        return medium
 
     def build_phase(self) -> PhaseFunction:
         """The phase function; MissingExtraError for droplets without miepython."""

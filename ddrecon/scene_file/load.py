@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import glob
+import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -18,11 +20,18 @@ from ddrecon.grid import Triple
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.records import Violation
+from ddrecon.scene_file.camera_files import in_order, node_of, read_colmap, read_transforms
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
-from ddrecon.scene_file.read import Rule, read_record
+from ddrecon.scene_file.read import Rule, path_in, read_record
 from ddrecon.scene_file.schema import SceneTree
-from ddrecon.scene_file.transforms import node_of
-from ddrecon.scene_file.view_sources import views_of
+from ddrecon.scene_file.view_schema import (
+    FRAME,
+    PerspectiveSection,
+    RingSection,
+    ViewSection,
+    ViewSource,
+    split_views,
+)
 from ddrecon.settings import AUTO, ParameterSettings
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -36,6 +45,8 @@ from ddrecon.variables.kinds import (
 T = TypeVar("T")
 PARAMETERS = "optimize.parameters"
 """Where keys are the names of variables, dots and all."""
+DECIMAL = r"(?:(?<=_)-)?[0-9]+(?:\.[0-9]+)?"
+"""A number in a name, if it may have a sign and a fraction."""
 MAX_BYTES = 2**20
 """A scene file is no larger; thousands of views fit."""
 
@@ -93,7 +104,7 @@ def read_scene(
     problems.raise_any()
     assert scene_file is not None
     if AUTO in (scene_file.tree.volume.bounds, scene_file.tree.volume.resolution):
-        from ddrecon.scene_file.box import fit_volume  # here, as it loads torch
+        from ddrecon.scene_file.build_views import fit_volume  # here, as it loads torch
 
         return fit_volume(scene_file)
     return scene_file
@@ -226,6 +237,98 @@ def _violations(
     if last in EXTINCTION_AND_ALBEDO and pair:
         pairs = "take sigma_a and sigma_s, or sigma_t and albedo"
         yield "", f"cannot be optimized beside {pair[0]}: {pairs}"
+
+
+def views_of(
+    node: Node, source: ViewSource | tuple[ViewSection, ...], folder: Path, up: Triple
+) -> tuple[ViewSection, ...]:
+    """The named views that `source` lists or stands for, which `node` of a scene in `folder` says.
+
+    `up` points up in the scene.
+    """
+    if isinstance(source, tuple):
+        return name_listed(node, source)
+    entries, every = node.entries(), source.test_every
+    if "images" in entries:
+        folder = entries["images"].folder or folder
+    if source.transforms is not None:
+        files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
+        return name_by_images(read_transforms(entries["transforms"], files, every))
+    if source.colmap is not None:
+        read = read_colmap(entries["colmap"], source.colmap, path_in(folder, source.images or ""))
+        return name_by_images(split_views(read, every))
+    assert source.ring is not None
+    cameras = ring_cameras(source.ring, up)
+    images: list[Path] | list[None] = [None] * len(cameras)
+    if source.images is not None:
+        # Wildcards stand in the last two parts: those above may match without end.
+        patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
+        is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
+        names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
+        matches = sorted(next(filter(None, names), []), key=in_order)
+        if matches != sorted(matches, key=lambda name: in_order(name, DECIMAL)):
+            what = "matches names with fractions or signs, whose order is not plain: count them"
+            raise entries["images"].refused(f"{source.images!r} {what} 0, 1, 2, ...")
+        images = [path for name in matches if (path := (folder / name).absolute()).is_file()]
+        if len(images) != len(cameras):
+            what = f"{source.images!r} matches {len(images)} files, but the ring has"
+            raise entries["images"].refused(f"{what} {len(cameras)} cameras")
+    views = [
+        ViewSection(name=f"ring_{index:02d}", camera=camera, image=image)
+        for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    return tuple(split_views(views, every))
+
+
+def name_listed(node: Node, views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
+    """The `views` of `node`, nameless ones called by their place; SceneError for equal names."""
+    problems, first = Problems(), dict[str, int]()
+    names = [view.name or f"view_{index:02d}" for index, view in enumerate(views)]
+    for index, name in enumerate(names):
+        if first.setdefault(name, index) != index:
+            child = node.children()[index]
+            what = f"{name!r} is already the name of view {first[name]}"
+            problems.note(child.entries().get("name", child).refused(what))
+    problems.raise_any()
+    return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
+
+
+def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
+    """`views` with names, all different, by their images where they have some."""
+    paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
+    # A frame's number is no part of a name: the view of frames/{frame:04d}.png is that of a folder.
+    unnumbered = [FRAME.sub("", path.stem).strip("._-") or path.parent.name for path in paths]
+    # Of long ones the ends, as file names have room for.
+    stems, folders = (
+        [re.sub(r"[^A-Za-z0-9_-]", "_", word)[-99:] for word in words]
+        for words in (unnumbered, [path.parent.name for path in paths])
+    )
+    longer = [f"{folder}_{stem}" for folder, stem in zip(folders, stems, strict=True)]
+    numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]
+    names = next(names for names in (stems, longer, numbered) if len(set(names)) == len(names))
+    return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
+
+
+def ring_cameras(ring: RingSection, up: Triple) -> list[PerspectiveSection]:
+    """Camera i of n stands at target + height u + r (cos(2 pi i/n) a + sin(2 pi i/n) u x a).
+
+    u is the unit vector along the ring's own `up` or this one, and a the axis after the one
+    nearest to it, made perpendicular.
+    """
+    import numpy as np
+
+    upward = np.array(ring.up or up) / math.hypot(*(ring.up or up))
+    ahead = np.eye(3)[(np.abs(upward).argmax() + 1) % 3]
+    ahead = ahead - upward * (ahead @ upward)
+    ahead /= np.linalg.norm(ahead)
+    aside, cameras = np.cross(upward, ahead), []
+    for index in range(ring.count):
+        turn = 2 * math.pi * index / ring.count
+        outward = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
+        x, y, z = (np.array(ring.target) + ring.height * upward + outward).tolist()
+        camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
+        cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=ring.up or up))
+    return cameras
 
 
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:

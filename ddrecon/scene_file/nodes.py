@@ -94,7 +94,8 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
-        return _Composer(text, locate, problems).compose_document(key)
+        _require_strict(text, locate)
+        root = yaml.compose(text, Loader=LOADER)
     except yaml.MarkedYAMLError as error:
         where = _place(locate, error.problem_mark or error.context_mark)
         fault = ", ".join(filter(None, (error.context, error.problem)))
@@ -104,6 +105,10 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
         before = text.encode(errors="replace")[: error.position].decode(errors="ignore")
         where = locate(before.count("\n") + 1, len(before) - before.rfind("\n"))
         fault = f"the character {error.character!r} is not allowed"
+    else:
+        if root is None:
+            raise SceneError(f"{locate(1, 1)}: is empty")
+        return _node_of(root, locate, problems, key)
     raise SceneError(f"{where}: not YAML: {fault}")
 
 
@@ -112,65 +117,49 @@ def _place(locate: Locate, mark: Any) -> str:
     return locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
 
 
-class _Composer:
-    """Makes nodes of the events that PyYAML parses a text into."""
-
-    def __init__(self, text: str, locate: Locate, problems: Problems):
-        self.events = yaml.parse(text, Loader=LOADER)
-        self.locate, self.problems = locate, problems
-
-    def compose_document(self, key: str) -> Node:
-        """The node at `key` of the only document."""
-        next(self.events)
-        if isinstance(next(self.events), yaml.StreamEndEvent):
-            raise SceneError(f"{self.locate(1, 1)}: is empty")
-        root = self.compose(next(self.events), key, None, 0)
-        next(self.events)
-        if not isinstance(after := next(self.events), yaml.StreamEndEvent):
-            raise SceneError(f"{self.where(after)}: not YAML: expected a single document")
-        return root
-
-    def compose(self, event: Any, key: str, key_where: str | None, depth: int) -> Node:
-        """The node at `key` that begins with `event`, within `depth` others."""
-        where = self.where(event)
-        node = Node(key, where, key_where or where, None)
+def _require_strict(text: str, locate: Locate) -> None:
+    """Raises SceneError for aliases, tags and deep nesting, before anything recurses into them."""
+    depth = 0
+    for event in yaml.parse(text, Loader=LOADER):
+        fault = ""
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent):
-            raise node.refused("aliases such as *name are not supported; write the value again")
-        if event.tag:
-            raise node.refused(f"tags such as {event.tag!r} are not supported")
-        if isinstance(event, yaml.ScalarEvent):
-            node.value = event.value if event.style else resolve(event.value)
-        elif depth == MAX_DEPTH:
-            raise node.refused(f"nested more than {MAX_DEPTH} deep")
-        elif isinstance(event, yaml.SequenceStartEvent):
-            node.value = entries = list[Node]()
-            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
-                entries.append(self.compose(event, node.child_key(len(entries)), None, depth + 1))
-        else:
-            node.value = self.compose_entries(node, depth)
-        return node
+            fault = "aliases such as *name are not supported; write the value again"
+        elif tag := getattr(event, "tag", None):
+            fault = f"tags such as {tag!r} are not supported"
+        elif depth > MAX_DEPTH:
+            fault = f"nested more than {MAX_DEPTH} deep"
+        if fault:
+            raise SceneError(f"{_place(locate, event.start_mark)}: {fault}")
 
-    def compose_entries(self, parent: Node, depth: int) -> dict[str, Node]:
-        """The entries of the mapping `parent`, which has begun."""
-        entries = dict[str, Node]()
-        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
-            where = self.where(event)
-            if not isinstance(event, yaml.ScalarEvent):
-                raise SceneError(f"{where}: {parent.child_key('?')}: a key must be plain text")
-            name = event.value
+
+def _node_of(
+    yaml_node: Any, locate: Locate, problems: Problems, key: str, key_where: str = ""
+) -> Node:
+    where = _place(locate, yaml_node.start_mark)
+    node = Node(key, where, key_where or where, None)
+    if isinstance(yaml_node, yaml.ScalarNode):
+        node.value = yaml_node.value if yaml_node.style else resolve(yaml_node.value)
+    elif isinstance(yaml_node, yaml.SequenceNode):
+        node.value = [
+            _node_of(entry, locate, problems, node.child_key(index))
+            for index, entry in enumerate(yaml_node.value)
+        ]
+    else:
+        entries = node.value = dict[str, Node]()
+        for name_node, value in yaml_node.value:
+            name, place = name_node.value, _place(locate, name_node.start_mark)
+            if not isinstance(name_node, yaml.ScalarNode):
+                raise SceneError(f"{place}: {node.child_key('?')}: a key must be plain text")
             if not name or not name.isprintable():
                 name = repr(name)
-            child = self.compose(next(self.events), parent.child_key(name), where, depth + 1)
-            if name in entries:
-                place = entries[name].key_where
-                self.problems.note(child.key_refused(f"repeated key; it is already at {place}"))
-            else:
-                entries[name] = child
-        return entries
-
-    def where(self, event: Any) -> str:
-        """The place at which `event` begins."""
-        return _place(self.locate, event.start_mark)
+            child = _node_of(value, locate, problems, node.child_key(name), place)
+            if first := entries.get(name):
+                fault = f"repeated key; it is already at {first.key_where}"
+                problems.note(child.key_refused(fault))
+            entries.setdefault(name, child)
+    return node
 
 
 _WORDS: dict[str, Scalar] = {

@@ -81,30 +81,16 @@ def _describe(kind: Any, kinds: Sequence[Any]) -> str:
 def read_value(node: Node, rule: Rule) -> Any:
     """The value of `node` by `rule`; raises SceneError with everything wrong in it."""
     rule = rule._replace(folder=node.folder or rule.folder)
-    value = _read_kind(node, rule)
-    return rule.finish[node.key](node, value, rule.folder) if node.key in rule.finish else value
-
-
-def _read_kind(node: Node, rule: Rule) -> Any:
-    kinds = rule.kinds
     match node.value:
-        case None if NoneType in kinds:
-            return None
         case dict():
-            return _read_mapping(node, rule)
+            value = _read_mapping(node, rule)
         case list():
-            return _read_list(node, rule)
+            value = _read_list(node, rule)
         case str():
-            return _read_text(node, rule)
-        case bool() if bool in kinds:
-            return node.value
-        case bool() | None:
-            pass
-        case int() if int in kinds:
-            return _read_number(node, node.value, rule)
-        case int() | float() if float in kinds:
-            return float(_read_number(node, node.value, rule))
-    raise _refused(node, rule)
+            value = _read_text(node, rule)
+        case _:
+            value = _read_plain(node, rule)
+    return rule.finish[node.key](node, value, rule.folder) if node.key in rule.finish else value
 
 
 def _refused(node: Node, rule: Rule) -> Exception:
@@ -118,15 +104,25 @@ def _refused(node: Node, rule: Rule) -> Exception:
     return node.refused(f"expected {expected}, found {description}")
 
 
-def _read_number(node: Node, number: float, rule: Rule) -> float:
-    if not -LARGEST <= number <= LARGEST:
+def _read_plain(node: Node, rule: Rule) -> float | None:
+    """A number, true or false, or nothing."""
+    value, kinds = node.value, rule.kinds
+    if value is None or isinstance(value, bool):
+        if type(value) in kinds:
+            return value
+        raise _refused(node, rule)
+    assert isinstance(value, int | float)
+    is_whole = isinstance(value, int) and int in kinds
+    if not is_whole and float not in kinds:
+        raise _refused(node, rule)
+    if not -LARGEST <= value <= LARGEST:
         expected = "expected a finite number of single precision"
         raise node.refused(f"{expected}, found {describe_found(node)}")
-    if rule.choices and number not in rule.choices:
+    if rule.choices and value not in rule.choices:
         raise _refused(node, rule)
-    if fault := find_excess(number, rule.limits):
+    if fault := find_excess(value, rule.limits):
         raise node.refused(fault)
-    return number
+    return value if is_whole else float(value)
 
 
 def _read_text(node: Node, rule: Rule) -> str | Path:
@@ -189,14 +185,8 @@ def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     """That of `kinds` which the mapping `node` is, by its `type` or first required key."""
     entries = node.entries()
     if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
-        return next(
-            (
-                kind
-                for kind in kinds
-                if any(is_required(key) and key.name in entries for key in fields(kind))
-            ),
-            kinds[0],
-        )
+        needs = {kind: [key.name for key in fields(kind) if is_required(key)] for kind in kinds}
+        return next((kind for kind in kinds if entries.keys() & set(needs[kind])), kinds[0])
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}

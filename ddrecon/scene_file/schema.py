@@ -32,24 +32,6 @@ MAX_CELLS = 2**30
 
 
 @dataclass(frozen=True)
-class Profile:
-    """Values by height, such as those of a gas; `media` has how air stands beside a cloud.
-
-    heights: Along `volume.up` [u], each above the one before.
-    values: One at each height; linear between them, and even beyond.
-    """
-
-    heights: tuple[float, ...]
-    values: tuple[Color, ...]
-
-    def violations(self) -> Iterator[Violation]:
-        if any(after <= before for before, after in pairwise(self.heights)):
-            yield "heights", "must go up from one to the next"
-        if len(self.values) != len(self.heights) or not self.heights:
-            yield "values", f"expected one for each height, {len(self.heights)}"
-
-
-@dataclass(frozen=True)
 class Water:
     """Of droplets, `phase: {type: mie, ...}`: 1.5 / effective radius [micrometers] per meter, twice
     their cross section. `density` is then their liquid water [g/m3].
@@ -74,7 +56,25 @@ class ByLabel:
     name: str = "labels"
 
 
-ByCell = FieldFile | Profile | ByLabel
+@dataclass(frozen=True)
+class ByHeight:
+    """Values by height, such as those of a gas; `media` has how air stands beside a cloud.
+
+    heights: Along `volume.up` [u], each above the one before.
+    values: One at each height; linear between them, and even beyond.
+    """
+
+    heights: tuple[float, ...]
+    values: tuple[Color, ...]
+
+    def violations(self) -> Iterator[Violation]:
+        if any(after <= before for before, after in pairwise(self.heights)):
+            yield "heights", "must go up from one to the next"
+        if len(self.values) != len(self.heights) or not self.heights:
+            yield "values", f"expected one for each height, {len(self.heights)}"
+
+
+ByCell = FieldFile | ByHeight | ByLabel
 Density = float | ByCell
 Quantity = Color | ByCell
 
@@ -425,12 +425,6 @@ class SceneTree:
     def violations(self) -> Iterator[Violation]:
         if not self.lights and not self.glows:
             yield "lights", "there is none, and the volume has no emission"
-        for name in self.optimize.parameters if self.optimize else ():
-            medium, last = split_name(name)
-            section = self.media.get(medium.removeprefix("media.").strip("."))
-            has_g = section and isinstance(section.phase, HenyeyGreensteinSection | None)
-            if last == "phase.g" and has_g:
-                yield "optimize", f"parameters.{name} is called {medium}g here"
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:

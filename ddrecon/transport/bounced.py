@@ -16,7 +16,7 @@ from ddrecon.light.moments import add, beam_moments
 from ddrecon.light.refracted import RefractedBeam, enter_faces
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.fresnel import reflectance
+from ddrecon.medium.optics import reflectance
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.transport.characteristics import Characteristic, Ends, follow

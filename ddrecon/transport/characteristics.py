@@ -21,9 +21,9 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.shear import slice_along
-from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
-from ddrecon.numerics.slicing import NEARLY, Slicing, across
+from ddrecon.numerics.layout import NEARLY, Slicing, across
+from ddrecon.numerics.remember import constant
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""

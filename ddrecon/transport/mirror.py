@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.fresnel import quadrature_reflectances
+from ddrecon.medium.optics import quadrature_reflectances
 from ddrecon.transport.characteristics import Characteristic, Direction, Ends
 
 SIDES = tuple((axis, end) for axis in range(3) for end in (0, -1))

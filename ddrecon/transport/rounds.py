@@ -197,7 +197,7 @@ def _gain(
     """
     step = _mean_step(medium.grid, directions)
     if is_fused() and not medium.is_cellwise:
-        from ddrecon.transport.fused.gain import gain_fused
+        from ddrecon.transport.fused.sweep import gain_fused
 
         return gain_fused(medium, change, off, cosine, DAMPING, step)
     share = recompute(_transport_share, medium, step)

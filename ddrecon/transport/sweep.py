@@ -18,11 +18,10 @@ from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill, join
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.constants import constant
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.periods import apply_around
+from ddrecon.numerics.layout import NEARLY, apply_around
 from ddrecon.numerics.quadrature import layer_quadrature, sphere_quadrature
-from ddrecon.numerics.slicing import NEARLY
+from ddrecon.numerics.remember import constant
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
 from ddrecon.transport.mirror import Mirror
 
@@ -176,7 +175,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         rows = depths, twice, scattering.scale.view(1, -1)
         colors = max(row.shape[1] for row in rows)
         numbers = torch.cat([row.expand(-1, colors) for row in rows])
-        name = "transport/fused/steep.h", "Steep", 3
+        name = "transport/fused/gain.h", "Steep", 3
         return torch.stack(
             apply_cell(*name, numbers, extinction.field, scattering.field, *gradient)
         )
@@ -212,7 +211,7 @@ def cell_gradient(q: Tensor) -> Tensor:
     Half the difference of both neighbors; at the faces of the box, that to the one.
     """
     if is_fused():
-        from ddrecon.diffusion.fused.around import rises_fused
+        from ddrecon.diffusion.fused.cells import rises_fused
 
         return rises_fused(q)
     return torch.stack(

@@ -2,36 +2,63 @@
 
 What a run found is itself a volume whose pictures can be made. It is not quite like what is true: a
 reconstruction of it lacks what this lacks of it. So the next experiment's volume gets that back.
+A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
+`RATIO`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.io.files.atomic import write_json
+from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST
+from ddrecon.ranks import sum_over_ranks
+from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
-from ddrecon.reconstruct.shares import share_pictures
+from ddrecon.report.page import write_page
+from ddrecon.run.job import Job, Told
+from ddrecon.run.report import describe_fields
+from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene
-from ddrecon.variables.values import with_values
+from ddrecon.variables.kinds import kind_of, split_name
+from ddrecon.variables.values import component_names, fields_of, with_values
 
-MORE_ROUNDS = 3
+MORE_ROUNDS, MOST_ROUNDS = 3, 16
 """Transport rounds by which an experiment's pictures are closer to truth than the run's model."""
-MOST_ROUNDS = 16
+RATIO = 1.55
+"""The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
+lack what no reconstruction shows (docs/uncertainty.md)."""
+EMPTY = 0.02
+"""Cells of less than this part of the largest are empty."""
+WIDTH = 3
+"""Cells a side over which errors are averaged."""
+RECORD = "uncertainty.json"
+ASSUMED = (
+    "Deviations come from experiments: the reconstruction was photographed, with more transport"
+    " rounds than the run had and the errors of its pictures, and reconstructed by the same"
+    f" settings. They are scaled by {RATIO}, the ratio of true to simulated errors on four volumes"
+    " of known truth. Cameras, lights and optics that were not optimized are taken for true, and of"
+    " what no camera sees experiments say nothing."
+)
 
 
-class Uncertainty:
+class Uncertainty(Job):
     """Experiments, so many `wanted`, about what `run`, which is done, has found: a job.
 
     `values` are what was found, by name, and `errors` of each experiment so far how far it was from
@@ -39,11 +66,16 @@ class Uncertainty:
     `deviation` is that of all pixels.
     """
 
+    title = "uncertainty"
+
     def __init__(self, run: Reconstruction, seed: int, wanted: int = 2):
         self.run, self.parameters, self.seed = run, run.parameters, seed
-        self.wanted, self.seconds = wanted, 0.0
+        self.wanted, self.seconds, self.path = wanted, 0.0, Path()
         views, settings = run.level.train.views, run.problem.settings
         self.values = {p.name: p.value.detach() for p in run.parameters}
+        sums = {name: float(value.double().abs().sum()) for name, value in self.values.items()}
+        noise = None if settings.noise is None else vars(settings.noise)
+        self.result_of = {"iteration": run.iteration, "values": sums, "seed": seed, "noise": noise}
         images = photograph(run.level.train, self.values)
         self.residuals = {v.name: target_of(v) - images[v.name] for v in views}
         noises = {v.name: given_noise(v, settings) for v in views}
@@ -123,6 +155,80 @@ class Uncertainty:
             self.trial = self._begin()
             self.trial.restore(state["trial"])
 
+    def begin(self, folder: Folder, is_resumed: bool) -> None:
+        """Removes what earlier experiments have left in the folder, or `is_resumed`."""
+        self.path = folder.path
+        if not is_resumed:
+            folder.clear()
+
+    def fields(self) -> dict[str, Field]:
+        """The deviations of all fields and maps by the experiments so far, by name."""
+        return {p.name: Field(self, p) for p in self.parameters if not is_tabled(p)}
+
+    def numbers(self) -> dict[str, dict[str, float]]:
+        """The value and the deviation of each number, and of the mass of each density, by name."""
+        numbers, tabled = (
+            dict[str, dict[str, float]](),
+            [p for p in self.parameters if is_tabled(p)],
+        )
+        for p in self.parameters:
+            if split_name(p.name)[1] == "density" and not is_tabled(p):
+                cell = math.prod(p.grid.spacing)
+                sums = torch.tensor([float(e[p.name].double().sum()) for e in self.errors])
+                mass = cell * float(self.values[p.name].double().sum())
+                numbers[f"mass of {p.name}"] = _with_deviation(mass, cell * sums)
+        for p in tabled:
+            # All views' numbers of one kind err alike, and so do all entries of other numbers.
+            alike = [q for q in tabled if q.view is not None and q.key == p.key]
+            names = [q.name for q in alike or [p]]
+            stacked = [torch.stack([e[name].flatten() for name in names]) for e in self.errors]
+            for at, name in enumerate(_entry_names(p)):
+                errors = [e[:, at] if alike else e.square().mean(1).sqrt() for e in stacked]
+                value = float(p.value.detach().flatten()[at])
+                numbers[name] = _with_deviation(value, torch.cat(errors))
+        return numbers
+
+    def finish(self) -> Told:
+        """Writes deviations, as volumes and as a page, and tells `uncertainty.json`."""
+        fields, numbers, path = self.fields(), self.numbers(), self.path
+        (path / "volumes").mkdir(exist_ok=True)
+        for name, field in fields.items():
+            for kind, values in {"std": field.deviation, "mean": field.value}.items():
+                stem, is_map = path / "volumes" / f"{name}_{kind}", not kind_of(name).is_cellwise
+                write_values(stem, stem.name, values, field.parameter.grid, is_map=is_map)
+        source = "the scene" if self.is_noise_known else "residuals"
+        record: dict[str, Any] = {
+            "experiments": self.count,
+            "seconds": self.seconds,
+            "iterations": self.iteration,
+            "noise": {"deviation": self.deviation, "from": source},
+            "assumed": ASSUMED,
+            "fields": {name: field.describe() for name, field in fields.items()},
+            "numbers": numbers,
+        }
+        write_json(path / RECORD, record)
+        lead = (
+            f"Experiments: {self.count}, in {self.seconds:.1f} s; pictures err by"
+            f" {self.deviation:.3g} of radiance (from {source})"
+        )
+        lines = [_field_text(name, field) for name, field in record["fields"].items()]
+        rows = [(n, f"{x['value']:.5g} +- {x['deviation']:.2g}") for n, x in numbers.items()]
+        scene = self.run.current_scene()
+        shown = {
+            f"deviation of {n}": f.deviation for n, f in fields.items() if kind_of(n).is_cellwise
+        }
+        first = next(iter(shown), "density")
+        shown = {name: value.cpu() for name, value in fields_of(scene).items()} | shown
+        cells = [(name, "result", value, None) for name, value in shown.items()]
+        write_page(
+            path / "report.html",
+            title=f"ddrecon: how sure a run is ({path.absolute().name})",
+            lead=f"{lead}.",
+            volume=describe_fields(scene, cells, lines, first),
+            numbers={"heading": "Numbers", "head": ("", ""), "rows": rows, "text": ASSUMED},
+        )
+        return record, [lead, *lines, *(f"{name}: {text}" for name, text in rows), ASSUMED]
+
     def _begin(self) -> Reconstruction:
         """The next experiment: its pictures, and a run that is to find its `truth` from them.
 
@@ -143,12 +249,18 @@ class Uncertainty:
 
 def photograph(scene: Scene, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The pictures [3, h, w] of `scene` with `values`, by name."""
+    names = [view.name for view in scene.views]
+    rendered = own_views(scene, names)
     with torch.no_grad():
         world = with_values(scene, values)
         light_field = solve_light(world, SolveMemory())
-        return share_pictures(
-            scene, lambda view: view_picture(light_field, world, world.view(view.name))
-        )
+        pictures = [
+            view_picture(light_field, world, world.view(view.name))
+            if view.name in rendered
+            else scene.volume.density.new_zeros(3, *view.camera.size)
+            for view in scene.views
+        ]
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def bring_closer(scene: Scene) -> Scene:
@@ -163,3 +275,81 @@ def bring_closer(scene: Scene) -> Scene:
 def is_tabled(parameter: Parameter) -> bool:
     """Whether the entries of `parameter` are a table of numbers: it is no field and no map."""
     return not parameter.is_field and parameter.value.ndim < 3
+
+
+class Field:
+    """The deviations [..., z, y, x] of the field, or map, of `parameter`, by `experiments`."""
+
+    def __init__(self, experiments: Uncertainty, parameter: Parameter):
+        self.parameter, name = parameter, parameter.name
+        self.value = experiments.values[name].cpu().double()
+        self.errors = [errors[name].cpu().double() for errors in experiments.errors]
+        self.squares = [mean_around(error.square(), WIDTH) for error in self.errors]
+        self.is_smoke = self.value.abs() > EMPTY * self.value.abs().max()
+        self.deviation = self.deviation_by(self.squares)
+
+    def deviation_by(self, squares: Sequence[Tensor]) -> Tensor:
+        """The deviation of each cell by some experiments' mean `squares` of errors around it."""
+        tiny = torch.finfo(torch.float32).tiny
+        return RATIO * torch.stack([*squares]).mean(0).sqrt().clamp(min=tiny)
+
+    def describe(self) -> dict[str, float | None]:
+        """Root mean squares over the smoke, and the shares of errors within 1 and 2 deviations.
+
+        Deviations there are by the other experiments; of a single one nothing is known.
+        """
+        smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
+        ratios = [
+            (error.abs() / self.deviation_by(others))[smoke]
+            for at, error in enumerate(self.errors)
+            if (others := self.squares[:at] + self.squares[at + 1 :])
+        ]
+        return {
+            "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
+            "deviation": float(self.deviation[smoke].square().mean()) ** 0.5,
+            **{
+                f"within_{k}": float((torch.cat(ratios) < k).double().mean()) if ratios else None
+                for k in (1, 2)
+            },
+        }
+
+
+def mean_around(field: Tensor, width: int) -> Tensor:
+    """The mean of `field` [..., z, y, x] over `width`^3 cells around each, `width` being odd.
+
+    Beyond the box there are no cells: those that there are count alone.
+    """
+    cells = field.reshape(1, -1, *field.shape[-3:])
+    means = avg_pool3d(cells, width, 1, width // 2, count_include_pad=False)
+    return means.view(field.shape)
+
+
+def volumes_in(folder: Path) -> list[Path]:
+    """The volumes of the `folder` of experiments, in order; else none."""
+    is_sure = kind_of_folder(folder) == UNCERTAINTY
+    return sorted((folder / "volumes").glob("*.npz")) if is_sure else []
+
+
+def _field_text(name: str, field: Mapping[str, Any]) -> str:
+    """How far off a field is, and how often that held in experiments."""
+    size, of = field["deviation"], field["root_mean_square"]
+    text = f"{name}: deviation {size:.3g} of {of:.3g} (root mean squares over the smoke)"
+    if field["within_1"] is None:
+        return text
+    shares = " and ".join(f"{100 * field[f'within_{k}']:.0f} %" for k in (1, 2))
+    return f"{text}; of errors in experiments {shares} lay within one and two deviations"
+
+
+def _with_deviation(value: float, errors: Tensor) -> dict[str, Any]:
+    """A number with its deviation, by the `errors` of experiments: wider where there are few."""
+    size = float(errors.double().square().mean().sqrt())
+    return {"value": value, "deviation": RATIO * (1 + 2 / len(errors)) * size}
+
+
+def _entry_names(parameter: Parameter) -> Sequence[str]:
+    """The names of the entries of a `parameter` that is tabled."""
+    name, value = parameter.name, parameter.value
+    if value.numel() == 1:
+        return [name]
+    components = component_names(name, value) if value.ndim else ()
+    return [f"{name}.{component}" for component in components or range(value.numel())]

@@ -33,8 +33,8 @@ from ddrecon.lighting import solve_light
 from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
 from ddrecon.medium.coefficients import Medium, keep_medium
-from ddrecon.medium.fresnel import reflectance, transmitted_moments
 from ddrecon.medium.levels import refine_medium
+from ddrecon.medium.optics import reflectance, transmitted_moments
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene

@@ -34,21 +34,14 @@ from ddrecon.variables.values import (
     with_values,
 )
 
-TOLERANCE = 1e-13
-"""Relative residual of the solves."""
-AGREE_MODES = 1e-10
-AGREE_DIFFERENCES = 1e-6
+AGREE_MODES, AGREE_DIFFERENCES = 1e-10, 1e-6
+"""The largest errors that pass."""
 CLOSE = 1e-8
 """The error of a difference below which no shorter step is tried."""
 NEGLIGIBLE = 1e-6
-"""Errors are relative to the derivative they are of, or to this part of the parameter's largest
-where that is more. What the last digits of the loss can make is no error.
-"""
-SHORTER, MORE = 0.1, 3
-"""Factor from step to step, and how many more are tried where no step agrees."""
+"""Errors are relative to the derivative they are of, or to this part of the parameter's largest."""
 TOGETHER = "all at once"
 """What the check of all parameters together is called."""
-
 TINY = torch.finfo(torch.float64).tiny
 
 Values = Mapping[str, Tensor]
@@ -92,31 +85,25 @@ class GradientCheck:
             entry.error <= AGREE_DIFFERENCES for entry in self.entries
         )
 
-    def row(self) -> list[str]:
-        """The check as a row of the table, with its worst entry."""
-        worst = max(self.entries, key=lambda entry: entry.error)
-        errors = f"{self.modes_error:.1e}", f"{worst.error:.1e}"
-        place = worst.entry, f"{worst.step:.1e}", f"{worst.adjoint:.7e}"
-        return [self.parameter, "pass" if self.has_passed else "FAIL", *errors, *place]
-
-
-HEAD = (
-    *("parameter", "verdict", f"tangent - adjoint (allowed {AGREE_MODES:.0e})"),
-    f"differences - adjoint (allowed {AGREE_DIFFERENCES:.0e})",
-    *("at worst", "step", "derivative"),
-)
-
 
 def table(checks: Sequence[GradientCheck]) -> list[str]:
-    """The checks as a table in Markdown; errors are relative."""
-    return table_lines(HEAD, [check.row() for check in checks])
+    """The checks as a table in Markdown, each with its worst entry; errors are relative."""
+    modes = f"tangent - adjoint (allowed {AGREE_MODES:.0e})"
+    differences = f"differences - adjoint (allowed {AGREE_DIFFERENCES:.0e})"
+    head, rows = ("parameter", "verdict", modes, differences, "at worst", "step", "derivative"), []
+    for check in checks:
+        worst = max(check.entries, key=lambda entry: entry.error)
+        row = [check.parameter, "pass" if check.has_passed else "FAIL", f"{check.modes_error:.1e}"]
+        row += [f"{worst.error:.1e}", worst.entry, f"{worst.step:.1e}", f"{worst.adjoint:.7e}"]
+        rows.append(row)
+    return table_lines(head, rows)
 
 
 def describe(checks: list[GradientCheck]) -> dict[str, Any]:
     """The checks as plain values, for a JSON file."""
     return {
         "passed": all(check.has_passed for check in checks),
-        "checks": [{**asdict(check), "passed": check.has_passed} for check in checks],
+        "checks": [asdict(check) | {"passed": check.has_passed} for check in checks],
     }
 
 
@@ -130,20 +117,15 @@ def check_parameters(
     """
     known = variable_names(scene)
     if unknown := [name for name in names if name not in known]:
-        raise UsageError(
-            [
-                f"--parameter {name}: the scene has no such number{suggestion(name, known)}"
-                for name in unknown
-            ]
-        )
+        fault = "the scene has no such number"
+        raise UsageError([f"--parameter {n}: {fault}{suggestion(n, known)}" for n in unknown])
     optimized = scene.optimize.parameters if scene.optimize else density_names(scene)
     names, generator = tuple(dict.fromkeys(names or optimized)), torch.Generator().manual_seed(seed)
     point = starting_point(scene, names, generator)
     loss = loss_at(scene, point, generator)
-    leaves = {name: point[name].clone().requires_grad_() for name in names}
-    bars = torch.autograd.grad(
-        loss(leaves), list(leaves.values()), allow_unused=True, materialize_grads=True
-    )
+    leaves = [point[name].clone().requires_grad_() for name in names]
+    value = loss(dict(zip(names, leaves, strict=True)))
+    bars = torch.autograd.grad(value, leaves, allow_unused=True, materialize_grads=True)
     values = {name: (point[name], bar) for name, bar in zip(names, bars, strict=True)}
     checks = [
         _check(name, loss, {name: values[name]}, samples, generator)
@@ -164,25 +146,21 @@ def _check(
     """The check of `parameters`, values with their gradients, along a random direction, and by
     `samples` entries of each.
     """
-    values = {name: value for name, (value, _) in parameters.items()}
-    steps = {
-        name: [step * (float(value.abs().max()) or 1.0) for step in kind_of(name).difference_steps]
-        for name, value in values.items()
-    }
-    # The direction is as long as the longest steps: those along it are shares of 1.
-    direction = {
-        name: 2 * (random_like(value, generator) - 0.5) * steps[name][0]
-        for name, value in values.items()
-    }
-    first = next(iter(steps.values()))
-    shares = [step / first[0] for step in first]
-    adjoint = float(sum((bar * direction[name]).sum() for name, (_, bar) in parameters.items()))
+    steps, direction, adjoint = dict[str, list[float]](), dict[str, Tensor](), 0.0
+    for name, (value, bar) in parameters.items():
+        size = float(value.abs().max()) or 1.0
+        steps[name] = [step * size for step in kind_of(name).difference_steps]
+        # The direction is as long as the longest steps: those along it are shares of 1.
+        direction[name] = 2 * (random_like(value, generator) - 0.5) * steps[name][0]
+        adjoint += float((bar * direction[name]).sum())
 
     def at(along: Values, step: float) -> float:
-        moved = {name: values[name] + step * change for name, change in along.items()}
+        moved = {name: parameters[name][0] + step * change for name, change in along.items()}
         with torch.no_grad():
             return float(loss(moved))
 
+    first = next(iter(steps.values()))
+    shares = [step / first[0] for step in first]
     compared = _compare(functools.partial(at, direction), adjoint, shares, 0.0)
     entries = [EntryCheck("a random direction", None, adjoint, *compared)]
     for name, (value, bar) in parameters.items() if samples else ():
@@ -193,19 +171,15 @@ def _check(
             slope, number = float(bar.flatten()[index]), float(value.flatten()[index])
             compared = _compare(functools.partial(at, {name: unit}), slope, steps[name], floor)
             entries.append(EntryCheck(entry_name(name, value, index), number, slope, *compared))
-    tangent = _tangent(loss, values, direction)
-    error = abs(tangent - adjoint) / max(abs(adjoint), TINY)
-    return GradientCheck(label, tangent, error, tuple(entries))
-
-
-def _tangent(loss: Loss, values: Values, direction: Values) -> float:
-    """The derivative of `loss` along `direction`, in forward mode."""
     with forward_ad.dual_level():
         duals = {
-            name: forward_ad.make_dual(value, direction[name]) for name, value in values.items()
+            name: forward_ad.make_dual(parameters[name][0], change)
+            for name, change in direction.items()
         }
-        tangent = forward_ad.unpack_dual(loss(duals)).tangent
-    return 0.0 if tangent is None else float(tangent)
+        derivative = forward_ad.unpack_dual(loss(duals)).tangent
+    tangent = 0.0 if derivative is None else float(derivative)
+    error = abs(tangent - adjoint) / max(abs(adjoint), TINY)
+    return GradientCheck(label, tangent, error, tuple(entries))
 
 
 def _compare(
@@ -215,14 +189,14 @@ def _compare(
 
     It is of fourth order: f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h. Each of the 18 values
     that this adds, counted by weight, may be off by one unit in the last place. Where none of
-    `steps` agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the usual
-    ones may be too long. What rounding makes of those is no excuse. Errors are relative to at least
-    `floor`, and infinite where a difference is not a number.
+    `steps` agrees, three shorter ones follow, without that allowance: in thick cells, or beside an
+    albedo of 1, all may be too long. Errors are relative to at least `floor`, and infinite where a
+    difference is not a number.
     """
     tried = list[tuple[float, float, float]]()
-    shorter = [steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
-    for index, step in enumerate((*steps, *shorter)):
-        is_usual, difference, error = index < len(steps), math.nan, math.nan
+    shorter = [steps[-1] / 10**power for power in (1, 2, 3)]
+    for step in (*steps, *shorter):
+        is_usual, difference, error = step in steps, math.nan, math.inf
         if tried and min(tried)[0] <= (CLOSE if is_usual else AGREE_DIFFERENCES):
             break
         # A step that leaves what is physical may have no solution.
@@ -230,9 +204,8 @@ def _compare(
             ahead, back, far_ahead, far_back = (at(times * step) for times in (1, -1, 2, -2))
             difference = (8 * (ahead - back) - (far_ahead - far_back)) / (12 * step)
             largest = max(map(abs, (ahead, back, far_ahead, far_back)))
-            rounding = 18 * torch.finfo(torch.float64).eps * largest / (12 * step)
-            allowed = rounding / AGREE_DIFFERENCES if is_usual else 0.0
-            scale = max(abs(difference), abs(adjoint), floor, allowed, TINY)
+            rounding = is_usual * 18 * torch.finfo(torch.float64).eps * largest / (12 * step)
+            scale = max(abs(difference), abs(adjoint), floor, rounding / AGREE_DIFFERENCES, TINY)
             error = abs(difference - adjoint) / scale
         tried.append((error if math.isfinite(error) else math.inf, step, difference))
     error, step, difference = min(tried)
@@ -273,7 +246,7 @@ def loss_at(scene: Scene, point: Values, generator: torch.Generator) -> Loss:
 
     Targets are the images of the views that have them, else random ones.
     """
-    exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
+    exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=1e-13))
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
     targets, memory = dict[str, Target](), SolveMemory(is_warm=False)
     for view in [view for view in scene.views if view.image is not None] or scene.views:

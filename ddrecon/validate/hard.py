@@ -2,14 +2,16 @@
 
 Scenes are written in double precision and rounded once, as by the loader. Results must be finite,
 the same in single and double precision, solved as far as rounding allows, lose no light and have no
-radiance below zero.
+radiance below zero. The plume, which is measured, is in the same words.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,8 +45,7 @@ precision can reach.
 
 def ball(shape: Shape) -> Tensor:
     """A soft ball, or what it becomes in a box that is no cube, with vacuum around it."""
-    lines = [(2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1 for n in shape]
-    z, y, x = torch.meshgrid(*lines, indexing="ij")
+    z, y, x = (2 * place for place in _centers(shape))
     return (1 - (z**2 + y**2 + x**2) / 0.8).clamp(min=0)
 
 
@@ -53,6 +54,12 @@ def layer(shape: Shape) -> Tensor:
     density = torch.full(shape, 1e-6, dtype=torch.float64)
     density[:, shape[1] // 4 : shape[1] - shape[1] // 4] = 1
     return density
+
+
+def _centers(shape: Shape) -> tuple[Tensor, ...]:
+    """Where along z, y and x each cell lies in a box from -0.5 to 0.5."""
+    lines = [(torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5 for n in shape]
+    return torch.meshgrid(*lines, indexing="ij")
 
 
 @dataclass(frozen=True)
@@ -86,13 +93,9 @@ class HardCase:
         z, y, x = (side / 2 for side in self.sides)
         grid = Grid(self.shape, (-z, -y, -x), (z, y, x))
         sigma_t = self.depth / min(grid.spacing)
-        volume = Volume(
-            grid,
-            self.density(self.shape).to(device, dtype),
-            tensor([sigma_t * (1 - self.albedo)]),
-            tensor([sigma_t * self.albedo]),
-            HenyeyGreenstein(tensor(self.g)),
-        )
+        sigma_a, sigma_s = (tensor([sigma_t * part]) for part in (1 - self.albedo, self.albedo))
+        density = self.density(self.shape).to(device, dtype)
+        volume = Volume(grid, density, sigma_a, sigma_s, HenyeyGreenstein(tensor(self.g)))
         lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([3.0]))]
         if self.ambient:
             lights.append(AmbientLight(tensor([self.ambient])))
@@ -105,141 +108,132 @@ class HardCase:
         return Scene(volume, lights, views, RenderSettings(steps_per_voxel=1), diffusion)
 
 
-SLAB = 1 / 24
-BAR = 1 / 32
-
+FULL, LAYER = partial(HardCase, torch.ones), partial(HardCase, layer)
+SLAB, BAR = 1 / 24, 1 / 32
+LONG = partial(FULL, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999)
 CASES: dict[str, HardCase] = {
     "vacuum": HardCase(torch.zeros),
     "vacuum, g 0.9, ambient light": HardCase(torch.zeros, g=0.9, ambient=0.5),
-    "density jumps by 1e6": HardCase(layer, depth=10),
-    "density jumps by 1e6, albedo 1, g 0.7": HardCase(layer, depth=10, albedo=1, g=0.7),
+    "density jumps by 1e6": LAYER(depth=10),
+    "density jumps by 1e6, albedo 1, g 0.7": LAYER(depth=10, albedo=1, g=0.7),
     **{
-        f"optical depth 1e{power:+d} a cell": HardCase(torch.ones, depth=10.0**power)
+        f"optical depth 1e{power:+d} a cell": FULL(depth=10.0**power)
         for power in (-8, -4, -2, 0, 1, 2, 4)
     },
-    "optical depth 1e+4 a cell, albedo 1": HardCase(torch.ones, depth=1e4, albedo=1),
-    "optical depth 1e+4 a cell, ball in vacuum": HardCase(ball, depth=1e4),
+    "optical depth 1e+4 a cell, albedo 1": FULL(depth=1e4, albedo=1),
+    "optical depth 1e+4 a cell, ball in vacuum": HardCase(depth=1e4),
     "albedo 0": HardCase(depth=3, albedo=0, ambient=0.5, shape=(8, 8, 8)),
     "albedo 1": HardCase(depth=3, albedo=1),
     "albedo 1 - 1e-7": HardCase(depth=3, albedo=1 - 1e-7),
     "g 0.99": HardCase(depth=3, g=0.99),
     "g -0.99": HardCase(depth=3, g=-0.99),
-    "g 0.99, albedo 1, full box": HardCase(torch.ones, depth=10, albedo=1, g=0.99),
-    "g 0.99, density jumps by 1e6": HardCase(layer, depth=100, albedo=0.5, g=0.99),
-    "g -0.99, density jumps by 1e6": HardCase(
-        layer, depth=0.2, albedo=0.5, g=-0.99, eye=(0.1, 2.5, 0.3)
-    ),
+    "g 0.99, albedo 1, full box": FULL(depth=10, albedo=1, g=0.99),
+    "g 0.99, density jumps by 1e6": LAYER(depth=100, albedo=0.5, g=0.99),
+    "g -0.99, density jumps by 1e6": LAYER(depth=0.2, albedo=0.5, g=-0.99, eye=(0.1, 2.5, 0.3)),
     "thin slab, 1 cell along x": HardCase(shape=(24, 24, 1), sides=(1, 1, SLAB), g=0.4),
     "thin slab, 1 cell along z": HardCase(shape=(1, 24, 24), sides=(SLAB, 1, 1), depth=40, g=0.4),
-    "long box, 256 x 8 x 8": HardCase(
-        torch.ones, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999, eye=(0.3, 0.5, 1.5)
-    ),
-    "long box, light and view along it": HardCase(
-        torch.ones,
-        shape=(8, 8, 256),
-        sides=(BAR, BAR, 1),
-        albedo=0.999,
-        travel=(-1, 0, 0),
-        eye=(1.5, 0, 0),
-        half_width=0.03,
-    ),
+    "long box, 256 x 8 x 8": LONG(eye=(0.3, 0.5, 1.5)),
+    "long box, light and view along it": LONG(travel=(-1, 0, 0), eye=(1.5, 0, 0), half_width=0.03),
     "voxels 1 : 5 : 0.2": HardCase(sides=(1, 5, 0.2), depth=0.3, g=0.4),
     "voxels 1 : 10 : 0.1": HardCase(sides=(1, 10, 0.1), depth=0.3, g=0.4),
     "light along +x": HardCase(travel=(1, 0, 0), g=0.4),
     "light along -y": HardCase(travel=(0, -1, 0), g=0.4),
     "light a millionth off -z": HardCase(travel=(1e-6, 0, -1), g=0.4),
     "camera inside the medium": HardCase(eye=(0.1, 0.12, 0.11), half_width=1, g=0.4),
-    "camera at a grazing angle": HardCase(
-        torch.ones, eye=(3, 0.505, 0), target=(0, 0.499, 0), half_width=0.2, g=0.4
+    "camera at a grazing angle": FULL(
+        eye=(3, 0.505, 0), target=(0, 0.499, 0), half_width=0.2, g=0.4
     ),
-    "camera in the plane of a face": HardCase(
-        torch.ones, eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False
+    "camera in the plane of a face": FULL(
+        eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False
     ),
 }
+HEAD: tuple[str, ...] = ("iterations", "residual", "attainable", "image_error", "gradient_error")
+HEAD += ("lowest", "energy", "energy_double", "depth")
+"""The numbers of a case; the first, up to `energy`, are of float32.
 
-
+Errors are relative RMS, absolute where nothing is; `lowest` is a part of the brightest pixel.
+"""
 SINGLE_FROM_DOUBLE = 1e-4
-"""Relative RMS error of images, and of gradients, in float32 against float64."""
+"""Errors of images, and of gradients, in float32 against float64."""
 OPAQUE = 400.0
 """Optical depths of a box beyond which errors may grow as these do: light is then seen where it
 comes in, and float32 knows that place to two roundings, 2e-7 of the box.
 """
 ROUNDINGS = 8
 """Residuals may exceed the tolerance by so many times what rounding the solution makes of them."""
-ENERGY = {torch.float32: 1e-4, torch.float64: 1e-10}
-NEGATIVE = 1e-7
-"""How far below zero radiance may be, as a part of the brightest pixel."""
 
 
-@dataclass(frozen=True)
-class HardNumbers:
-    """What is measured of a case; `iterations` to `energy` are of float32.
-
-    Errors are relative RMS, absolute where nothing is; `lowest` is a part of the brightest pixel.
-    """
-
-    iterations: int
-    residual: float
-    attainable: float
-    image_error: float
-    gradient_error: float
-    lowest: float
-    energy: float
-    energy_double: float
-    depth: float
-
-    def failures(self) -> list[str]:
-        """The bounds that are not kept; a NaN keeps none."""
-        single = SINGLE_FROM_DOUBLE * max(1, self.depth / OPAQUE)
-        is_balanced = self.energy <= ENERGY[torch.float32]
-        bounds = {
-            "residual": self.residual <= TOLERANCE[torch.float32] + ROUNDINGS * self.attainable,
-            "image": self.image_error <= single,
-            "gradient": self.gradient_error <= single,
-            "radiance": self.lowest >= -NEGATIVE,
-            "energy": is_balanced and self.energy_double <= ENERGY[torch.float64],
-        }
-        return [name for name, is_kept in bounds.items() if not is_kept]
+def find_failures(numbers: Mapping[str, float]) -> list[str]:
+    """The bounds that `numbers`, by the names of `HEAD`, do not keep; a NaN keeps none."""
+    single = SINGLE_FROM_DOUBLE * max(1, numbers["depth"] / OPAQUE)
+    most = TOLERANCE[torch.float32] + ROUNDINGS * numbers["attainable"]
+    bounds = {
+        "residual": numbers["residual"] <= most,
+        "image": numbers["image_error"] <= single,
+        "gradient": numbers["gradient_error"] <= single,
+        "radiance": numbers["lowest"] >= -1e-7,
+        "energy": numbers["energy"] <= 1e-4 and numbers["energy_double"] <= 1e-10,
+    }
+    return [name for name, is_kept in bounds.items() if not is_kept]
 
 
 def run_cases(device: torch.device, progress: Progress) -> dict[str, Any]:
-    """The numbers of every case of `CASES`, and its failures, as plain values."""
-    cases = dict[str, dict[str, Any]]()
-    for name in progress(list(CASES), "hard cases"):
-        try:
-            numbers = run_case(CASES[name], device)
-            cases[name] = asdict(numbers) | {"failures": numbers.failures()}
-        except SolveError as error:
-            cases[name] = {"failures": [str(error)]}
+    """The report of every case of `CASES`, and whether all have passed."""
+    cases = {name: run_case(CASES[name], device) for name in progress(list(CASES), "hard cases")}
     return {"passed": not any(case["failures"] for case in cases.values()), "cases": cases}
 
 
-def run_case(case: HardCase, device: torch.device) -> HardNumbers:
-    """What is measured of `case`, rendered in both precisions; SolveError where one gives up."""
-    (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
-        _render(case, dtype, device) for dtype in (torch.float32, torch.float64)
+def run_case(case: HardCase, device: torch.device) -> dict[str, Any]:
+    """The numbers of `case`, rendered in both precisions, and its `failures`; these alone where a
+    solve gives up.
+    """
+    try:
+        (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
+            _render(case, dtype, device) for dtype in TOLERANCE
+        )
+    except SolveError as error:
+        return {"failures": [str(error)]}
+    errors = relative_error(image, exact), relative_error(gradient, exact_gradient)
+    lowest = float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny))
+    residual, attainable, energy = balance
+    depth = case.depth * max(case.shape)
+    measured = (
+        iterations,
+        residual,
+        attainable,
+        *errors,
+        lowest,
+        energy,
+        exact_balance.energy,
+        depth,
     )
-    return HardNumbers(
-        iterations=iterations,
-        **asdict(balance),
-        image_error=relative_error(image, exact),
-        gradient_error=relative_error(gradient, exact_gradient),
-        lowest=float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
-        energy_double=exact_balance.energy,
-        depth=case.depth * max(case.shape),
-    )
+    numbers = dict(zip(HEAD, measured, strict=True))
+    return numbers | {"failures": find_failures(numbers)}
 
 
 def hard_lines(report: Mapping[str, Any]) -> list[str]:
     """The report of `run_cases` as a table, and how many cases failed."""
-    names, rows = [key.name for key in fields(HardNumbers)], list[list[str]]()
+    rows = list[list[str]]()
     for name, case in report["cases"].items():
-        numbers = [f"{case[key]:.2g}" if key in case else "" for key in names]
+        numbers = [f"{case[key]:.2g}" if key in case else "" for key in HEAD]
         failures = ", ".join(case["failures"])
         rows.append([name, *numbers, f"FAIL: {failures}" if failures else "pass"])
     failed = sum(bool(case["failures"]) for case in report["cases"].values())
-    head = ["case", *(name.replace("_", " ") for name in names), "verdict"]
+    head = ["case", *(name.replace("_", " ") for name in HEAD), "verdict"]
     return [*table_lines(head, rows), f"{len(rows)} cases, {failed} failed"]
+
+
+class Balance(NamedTuple):
+    """How far a solution is from balance (E2.4, E2.6, E2.7); all are 0 where there is no source.
+
+    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by, of b - A u
+    itself, which iterations update rather than compute; `attainable`: what rounding u makes of it;
+    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
+    """
+
+    residual: float = 0.0
+    attainable: float = 0.0
+    energy: float = 0.0
 
 
 def _render(
@@ -262,33 +256,15 @@ def relative_error(rounded: Tensor, exact: Tensor) -> float:
     return float((rounded.double() - exact).norm() / torch.where(size > 0, size, 1))
 
 
-@dataclass(frozen=True)
-class Balance:
-    """How far a solution is from balance (E2.4, E2.6, E2.7); all are 0 where there is no source.
-
-    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by, of b - A u
-    itself, which iterations update rather than compute; `attainable`: what rounding u makes of it;
-    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
-    """
-
-    residual: float = 0.0
-    attainable: float = 0.0
-    energy: float = 0.0
-
-
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
     grid, settings = scene.volume.grid, scene.diffusion
     medium = scale_medium(scene.volume, settings.angles)
-    cells = average_cells(medium)
-    lights = decompose_lights(scene.lights)
-    problem = DiffusionProblem(
-        cells,
-        Closure(settings.closure, grid, settings.floor),
-        cut(receive_in_parts(medium, cells, lights, settings).source)[0],
-        ambient_radiance(lights, solution),
-        cells.degree > 0,
-    )
+    cells, lights = average_cells(medium), decompose_lights(scene.lights)
+    source = cut(receive_in_parts(medium, cells, lights, settings).source)[0]
+    closure = Closure(settings.closure, grid)
+    outside = ambient_radiance(lights, solution)
+    problem = DiffusionProblem(cells, closure, source, outside, cells.degree > 0)
     operator, right = problem.system
     if not right.any():
         return Balance()
@@ -303,3 +279,39 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     # What rounding every entry of the solution by one unit in the last adds to it.
     rounding = torch.finfo(solution.dtype).eps * (scale * operator.diagonal * solution).norm()
     return Balance(residual, float(rounding / size), energy)
+
+
+def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.device) -> Scene:
+    """A plume on `cells` x 1.5 `cells` x `cells` cells, seen by `pixels` x `pixels` pixels.
+
+    Where it is densest it is about 8 optical depths thick.
+    """
+    plume = HardCase(
+        lambda shape: plume_density(*reversed(_centers(shape))),
+        depth=30 / cells,
+        albedo=0.95,
+        shape=(cells, cells * 3 // 2, cells),
+        sides=(1.0, 1.5, 1.0),
+        travel=(-2.0, -1.2, -0.5),
+        eye=(0.0, 0.3, 3.2),
+        half_width=math.tan(math.radians(15)),
+        pixels=pixels,
+    )
+    scene = plume.scene(dtype, device)
+    tolerance = DiffusionSettings.tolerance
+    return replace(scene, diffusion=replace(scene.diffusion, tolerance=tolerance))
+
+
+def plume_density(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column."""
+    rise = y + 0.5
+    away = torch.hypot(x - 0.1 * rise * torch.sin(7 * rise), z - 0.1 * rise * torch.cos(6 * rise))
+    ragged = torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
+    column = fade(away + 0.05 * ragged, 0.12 + 0.2 * rise, 0.1)
+    return column * fade(y.abs(), 0.46, 0.08) * (1 - 0.6 * rise)
+
+
+def fade(distance: Tensor, outer: Tensor | float, width: float) -> Tensor:
+    """1 below `outer` - `width`, falling smoothly to 0 at `outer`."""
+    depth = ((outer - distance) / width).clamp(0, 1)
+    return depth * depth * (3 - 2 * depth)

@@ -29,15 +29,9 @@ Change = Callable[["Scene", str, "Tensor"], "float | Tensor"]
 
 SOUGHT_DEPTH = 20.0
 """Optical depth that the densest medium may have across the box, where density is not known yet."""
-EMISSION_CHANGE = 5.0
-"""A change of what shines across the box's shortest side, in brightnesses of the pictures."""
 PIXELS = 0.25
 """Pixels by which a change of a camera's pose moves the image."""
-EXPOSURE_CHANGE = 0.05
-"""Change of an exposure, as a part of it."""
-OFFSET_CHANGE = 0.01
-"""Change of an offset, as a part of the root mean square of the picture."""
-RELATIVE_CHANGE = 0.1
+PART = 0.1
 """Change of a quantity as a part of its mean, or of the box's shortest side."""
 LONG_STEPS = (1e-2, 1e-3, 1e-4)
 """Changes for finite differences, as parts of the variable's largest value."""
@@ -51,13 +45,13 @@ XYZ = ("x", "y", "z")
 
 def cross_section_change(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the mean [1/u], which counts as at least what has an optical depth of 1."""
-    return RELATIVE_CHANGE * max(float(start.mean()), unit_of(scene, name))
+    return PART * max(float(start.mean()), unit_of(scene, name))
 
 
 def brightness_change(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the mean, which counts as at least `RELATIVE_CHANGE`, seen from the box's side."""
+    """A part of the mean, which counts as at least `PART`, seen from the box's side."""
     unit = _side(scene) ** 2 if name.endswith((".intensity", ".power")) else 1.0
-    return RELATIVE_CHANGE * max(float(start.mean()), RELATIVE_CHANGE * unit)
+    return PART * max(float(start.mean()), PART * unit)
 
 
 def pose_change(scene: Scene, name: str, start: Tensor) -> Tensor:
@@ -75,52 +69,46 @@ def pose_change(scene: Scene, name: str, start: Tensor) -> Tensor:
 
 
 def offset_change(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the root mean square of the view's picture, or of 1 where there is none."""
+    """A hundredth of the root mean square of the view's picture, or of 1 where there is none."""
     view = _view_of(scene, name)
-    return OFFSET_CHANGE * (1.0 if view.image is None else float(view.seen.square().mean().sqrt()))
+    return 0.01 * (1.0 if view.image is None else float(view.seen.square().mean().sqrt()))
+
+
+def side_change(scene: Scene, name: str, start: Tensor) -> float:
+    """A part of the box's shortest side [u]."""
+    return PART * _side(scene)
+
+
+def fixed_change(change: float) -> Change:
+    """`change` in every scene, for a variable with a natural unit."""
+    return lambda scene, name, start: change
 
 
 def unit_of(scene: Scene, name: str) -> float:
     """The density, or cross section, of an optical depth of 1 across the box's shortest side.
 
     A density counts by the mean extinction of the medium of `name`, where there is any, a cross
-    section by the largest density, or by `SOUGHT_DEPTH` where that is empty, an emission by the
-    pictures' brightness; 1 where that is not known, and for other variables.
+    section by the largest density, or by `SOUGHT_DEPTH` where that is empty. An emission [radiance/
+    u] looks as bright as the pictures of training views, weighted by themselves: black around what
+    shines does not count. It is 1 where that is not known, and for other variables.
     """
     volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
+    if kind == "emission":
+        shown = [view.seen for view in scene.views if view.image is not None and not view.is_test]
+        total = sum(float(image.mean()) for image in shown)
+        squares = sum(float(image.square().mean()) for image in shown)
+        return (squares / total if total > 0 else 1.0) / side
+    if kind != "density" and not kind.startswith("sigma_"):
+        return 1.0
     if volume.media is not None and name.startswith("media."):
         volume = volume.media[name.split(".")[1]]
-    if kind == "density" or kind.startswith("sigma_"):
-        sigmas = volume.sigma_a, volume.sigma_s
-        # Means count cells that have any.
-        share = max(float(sigma.count_nonzero()) / sigma.numel() for sigma in sigmas) or 1.0
-        depth = side * float(sum(sigma.mean() for sigma in sigmas)) / share
-        unit = 1 / depth if depth > 0 else 1.0
-        largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
-        return unit if kind == "density" else 1 / (side * largest)
-    return shown_emission(scene) if kind == "emission" else 1.0
-
-
-def shown_emission(scene: Scene) -> float:
-    """The emission [radiance/u] that looks as bright as the pictures, across the shortest side.
-
-    Pictures of training views are weighted by themselves: black around what shines does not count.
-    It is 1 where there are none.
-    """
-    shown = [view.seen for view in scene.views if view.image is not None and not view.is_test]
-    total = sum(float(image.mean()) for image in shown)
-    squares = sum(float(image.square().mean()) for image in shown)
-    return (squares / total if total > 0 else 1.0) / _side(scene)
-
-
-def side_change(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the box's shortest side [u]."""
-    return RELATIVE_CHANGE * _side(scene)
-
-
-def fixed_change(change: float) -> Change:
-    """`change` in every scene, for a variable with a natural unit."""
-    return lambda scene, name, start: change
+    sigmas = volume.sigma_a, volume.sigma_s
+    # Means count cells that have any.
+    share = max(float(sigma.count_nonzero()) / sigma.numel() for sigma in sigmas) or 1.0
+    depth = side * float(sum(sigma.mean() for sigma in sigmas)) / share
+    unit = 1 / depth if depth > 0 else 1.0
+    largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
+    return unit if kind == "density" else 1 / (side * largest)
 
 
 def _view_of(scene: Scene, name: str) -> View:
@@ -180,8 +168,9 @@ KINDS: Mapping[str, Kind] = {
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
+    # five brightnesses of the pictures, of what shines across the box's shortest side
     "emission": Kind(
-        lambda scene, name, start: EMISSION_CHANGE * unit_of(scene, name),
+        lambda scene, name, start: 5.0 * unit_of(scene, name),
         low=0,
         is_color=True,
         is_cellwise=True,
@@ -204,7 +193,7 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.rotation": Kind(fixed_change(1.0), difference_steps=SHORT_STEPS),
     # a turn by some 3 degrees
     "lights.N.direction": Kind(
-        lambda scene, name, start: RELATIVE_CHANGE / 2 * float(start.norm()),
+        lambda scene, name, start: PART / 2 * float(start.norm()),
         components=XYZ,
         is_direction=True,
         difference_steps=SHORT_STEPS,
@@ -220,7 +209,7 @@ KINDS: Mapping[str, Kind] = {
     ),
     # what a camera does to radiance: a factor, and what is added to it
     "views.NAME.exposure": Kind(
-        lambda scene, name, start: EXPOSURE_CHANGE * float(start.mean()), low=1e-3, is_color=True
+        lambda scene, name, start: 0.05 * float(start.mean()), low=1e-3, is_color=True
     ),
     "views.NAME.offset": Kind(offset_change, is_color=True),
     # of a perspective camera: its focal length in widths of the image, and the rest of its lens
@@ -237,7 +226,7 @@ KINDS: Mapping[str, Kind] = {
 FIELDS = tuple(name for name, kind in KINDS.items() if kind.is_cellwise)
 """Those that may differ from cell to cell."""
 PHASE = "phase."
-"""What variables of a phase function begin with; `phase.g` of Henyey and Greenstein's is `g`."""
+"""What variables of a phase function begin with, but `g` of Henyey and Greenstein's."""
 CROSS_SECTIONS = ("sigma_a", "sigma_s")
 EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
 PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)

@@ -14,9 +14,8 @@ from ddrecon.errors import UsageError
 from ddrecon.records import faults_of
 from ddrecon.scene import Scene, View
 from ddrecon.settings import LENSES
-from ddrecon.variables.forms import require_form, require_range, require_shape
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, RESPONSE, split_name
-from ddrecon.variables.values import stored_value, variable_names
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, RESPONSE, STEEPEST_G, kind_of, split_name
+from ddrecon.variables.values import find_readers, require_form, require_shape
 
 RIGID = 0.01
 """How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
@@ -53,14 +52,31 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     for name, value in _numbers_of(scene, views).items():
         require_form(name, value, value, density, cells)
         if value.is_cpu:
-            require_range(name, value)
+            _require_range(name, value)
+
+
+def _require_range(name: str, value: Tensor) -> None:
+    """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
+    kind = kind_of(name)
+    least, most = (float(end) for end in value.detach().aminmax())
+    range_found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
+    if not math.isfinite(least + most):
+        raise UsageError(f"{name}: must be finite, {range_found}")
+    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
+        # A scene may scatter further forward than a run makes it.
+        raise UsageError(f"{name}: must be above -1 and below 1, {range_found}")
+    if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
+        bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
+        raise UsageError(f"{name}: must be {bounds}, {range_found}")
+    if kind.is_direction and least == most == 0:
+        raise UsageError(f"{name}: must not be zero")
 
 
 def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
     """All that can be varied of `scene` and its `views`, by name, as it is stored."""
     numbers: dict[str, object] = {
-        name: stored_value(scene, name)
-        for name in variable_names(scene)
+        name: read()
+        for name, read in find_readers(scene).items()
         if not name.startswith("views.") and split_name(name)[1] not in EXTINCTION_AND_ALBEDO
     }
     for view in views:

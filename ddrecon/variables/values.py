@@ -8,27 +8,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import remix
+from ddrecon.medium.coefficients import Volume, remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.forms import require_form, shapes_in_place
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
     RESPONSE,
+    XYZ,
     is_of_volume,
     kind_of,
     split_name,
@@ -41,26 +43,53 @@ Settings = TypeVar("Settings")
 
 def variable_names(scene: Scene) -> list[str]:
     """The name of every variable of `scene`."""
-    lights = [
-        f"lights.{index}.{key}"
-        for index, light in enumerate(scene.lights)
-        for key, value in vars(light).items()
-        if isinstance(value, Tensor)
-    ]
-    views = [f"views.{view.name}.{key}" for view in scene.views for key in _view_keys(view)]
-    ground = [] if scene.ground is None else ["ground.albedo"]
-    return [*volume_names(scene.volume), *lights, *ground, *views]
+    return [*find_readers(scene)]
+
+
+def find_readers(scene: Scene) -> dict[str, Callable[[], Tensor]]:
+    """What reads the value of each variable of `scene`, by name."""
+    readers = find_volume_readers(scene.volume)
+    for index, light in enumerate(scene.lights):
+        keys = [key for key, value in vars(light).items() if isinstance(value, Tensor)]
+        readers |= {f"lights.{index}.{key}": partial(getattr, light, key) for key in keys}
+    if scene.ground is not None:
+        readers["ground.albedo"] = partial(getattr, scene.ground, "albedo")
+    for view in scene.views:
+        owner = f"views.{view.name}."
+        readers |= {owner + key: partial(_view_value, view, key) for key in _view_keys(view)}
+    return readers
+
+
+def find_volume_readers(volume: Volume) -> dict[str, Callable[[], Tensor]]:
+    """The same of `volume`: its phase function has its own numbers, or g alone."""
+    if volume.media is not None:
+        return {
+            f"media.{owner}.{name}": read
+            for owner, medium in volume.media.items()
+            for name, read in find_volume_readers(medium).items()
+        }
+    readers: dict[str, Callable[[], Tensor]] = {
+        name: partial(getattr, volume, name) for name in ("density", *CROSS_SECTIONS)
+    }
+    readers |= {"sigma_t": partial(extinction_of, volume), "albedo": partial(_albedo_of, volume)}
+    if volume.emission is not None:
+        readers["emission"] = partial(getattr, volume, "emission")
+    if isinstance(volume.phase, HenyeyGreenstein):
+        return readers | {"g": partial(getattr, volume, "g")}
+    numbers = volume.phase.variables
+    readers |= {PHASE + name: partial(numbers.__getitem__, name) for name in numbers}
+    return readers
 
 
 def density_names(scene: Scene) -> list[str]:
     """The names of the density of `scene`, or of those of its two media."""
-    return [name for name in volume_names(scene.volume) if split_name(name)[1] == "density"]
+    return [name for name in find_volume_readers(scene.volume) if split_name(name)[1] == "density"]
 
 
 def fields_of(scene: Scene) -> dict[str, Tensor]:
     """The variables that differ from cell to cell, [z, y, x] or of colors [C, z, y, x], by name."""
-    names = [name for name in volume_names(scene.volume) if kind_of(name).is_cellwise]
-    values = {name: volume_value(scene.volume, name) for name in names}
+    readers = find_volume_readers(scene.volume).items()
+    values = {name: read() for name, read in readers if kind_of(name).is_cellwise}
     return {name: value for name, value in values.items() if value.ndim >= 3}
 
 
@@ -72,25 +101,10 @@ def value_of(scene: Scene, name: str) -> Tensor:
     `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
     [1] or [3].
     """
-    stored = _stored_name(scene.volume, name)
-    if stored not in variable_names(scene):
+    known = find_readers(scene)
+    if name not in known:
         raise _unknown(scene, name)
-    return stored_value(scene, stored)
-
-
-def stored_value(scene: Scene, name: str) -> Tensor:
-    """The value of `name`, one of `variable_names(scene)`."""
-    section, _, path = name.partition(".")
-    owner, _, key = path.rpartition(".")
-    if section == "lights":
-        value: Tensor = getattr(scene.lights[int(owner)], key)
-        return value
-    if section == "views":
-        return _view_value(scene.view(owner), key)
-    if section == "ground":
-        assert scene.ground is not None
-        return scene.ground.albedo
-    return volume_value(scene.volume, name)
+    return known[name]()
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
@@ -102,18 +116,16 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     Raises UsageError for a name that is none, and for another shape, precision or device than the
     scene's.
     """
-    named, known = dict[str, Tensor](), {*variable_names(scene)}
+    named, known = dict[str, Tensor](), find_readers(scene)
     for name, value in values.items():
-        stored = _stored_name(scene.volume, name)
-        if stored not in known:
+        if name not in known:
             raise _unknown(scene, name)
-        owner, last = split_name(stored)
+        owner, last = split_name(name)
         if last == "density" and isinstance(value, Tensor) and value.ndim == 0:
             value = value.expand(scene.volume.grid.shape)
-        like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else stored
-        before = stored_value(scene, like)
-        require_form(stored, value, before, scene.volume.density, scene.volume.grid.shape)
-        named[stored] = value
+        like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else name
+        require_form(name, value, known[like](), scene.volume.density, scene.volume.grid.shape)
+        named[name] = value
     of_volume = {name: value for name, value in named.items() if is_of_volume(name)}
     lights: list[Light] = [
         replace(light, **_within(f"lights.{index}.", named))  # type: ignore[arg-type]
@@ -148,7 +160,55 @@ def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
     """Those that the variable `name` of `scene` may have; raises as `value_of`."""
     is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
     shape = () if is_pair else tuple(value_of(scene, name).shape)
-    return shapes_in_place(_stored_name(scene.volume, name), shape, scene.volume.grid.shape)
+    return shapes_in_place(name, shape, scene.volume.grid.shape)
+
+
+def shapes_in_place(
+    name: str, shape: tuple[int, ...], cells: tuple[int, ...]
+) -> list[tuple[int, ...]]:
+    """The shapes that the variable `name` may have in place of its own `shape`."""
+    kind, last = kind_of(name), split_name(name)[1]
+    if last == "density":
+        return [cells]
+    if last.startswith(PHASE):
+        return [shape, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
+    if kind.is_color:
+        tails = [(), cells] if kind.is_cellwise else [shape[1:]]
+        return [(color, *tail) for tail in tails for color in (1, 3)]
+    if kind.is_cellwise:
+        return [(), cells, (1, *cells)]
+    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [shape]
+
+
+def require_form(
+    name: str, value: Tensor, known: Tensor, like: Tensor, cells: tuple[int, ...]
+) -> None:
+    """Raises UsageError unless `value` can be the variable `name`, in place of `known`, on `cells`.
+
+    Its precision and device are to be those of `like`. Nothing is read from a GPU.
+    """
+    if not isinstance(value, Tensor):
+        raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
+    if not is_real(value):
+        raise UsageError(f"{name}: is {value.dtype}, {value.layout}; expected real and strided")
+    if (value.dtype, value.device) != (like.dtype, like.device):
+        raise UsageError(
+            f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
+            f"{like.device}; convert it by .to(...)"
+        )
+    require_shape(name, value, *shapes_in_place(name, tuple(known.shape), cells))
+
+
+def require_shape(name: str, value: Tensor | None, *shapes: tuple[int, ...]) -> None:
+    """Raises UsageError unless `value` is None or has one of `shapes`."""
+    if value is not None and tuple(value.shape) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in dict.fromkeys(shapes))
+        raise UsageError(f"{name}: has shape {list(value.shape)}; expected {expected}")
+
+
+def is_real(value: object) -> bool:
+    """Whether `value` is a tensor of real numbers, each in its place."""
+    return isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex()
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
@@ -194,41 +254,8 @@ def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def volume_names(volume: Volume) -> list[str]:
-    """The variables of `volume`: its phase function has its own numbers, or g alone."""
-    if volume.media is not None:
-        media = volume.media.items()
-        return [f"media.{owner}.{name}" for owner, medium in media for name in volume_names(medium)]
-    names = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
-    names += ["emission"] if volume.emission is not None else []
-    if isinstance(volume.phase, HenyeyGreenstein):
-        return [*names, "g"]
-    return [*names, *(PHASE + name for name in volume.phase.variables)]
-
-
-def _stored_name(volume: Volume, name: str) -> str:
-    """`name`, or `g` for `phase.g` where both are the same."""
-    owner, last = split_name(name)
-    if last != f"{PHASE}g":
-        return name
-    medium = (volume.media or {}).get(owner.removeprefix("media.").strip("."), volume)
-    return f"{owner}g" if isinstance(medium.phase, HenyeyGreenstein) else name
-
-
-def volume_value(volume: Volume, name: str) -> Tensor:
-    """The value of the variable `name` of `volume`."""
-    if volume.media is not None:
-        _, medium, variable = name.split(".", 2)
-        return volume_value(volume.media[medium], variable)
-    if name.startswith(PHASE):
-        return volume.phase.variables[name.removeprefix(PHASE)]
-    if name not in EXTINCTION_AND_ALBEDO:
-        value: Tensor = getattr(volume, name)
-        return value
-    sigma_t = extinction_of(volume)
-    if name == "sigma_t":
-        return sigma_t
-    _, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
+def _albedo_of(volume: Volume) -> Tensor:
+    sigma_t, (_, sigma_s) = extinction_of(volume), _same_axes(volume.sigma_a, volume.sigma_s)
     return sigma_s / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 
 
@@ -241,9 +268,9 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         return remix(volume, media)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
+        readers = find_volume_readers(volume)
         sigma_t, albedo = (
-            values[name] if name in values else volume_value(volume, name)
-            for name in EXTINCTION_AND_ALBEDO
+            values[name] if name in values else readers[name]() for name in EXTINCTION_AND_ALBEDO
         )
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
     phase = HenyeyGreenstein(stored.pop("g")) if "g" in stored else volume.phase
@@ -290,3 +317,42 @@ def _replace_view(view: View, values: Mapping[str, Tensor], center: Triple) -> V
     if "focal" in changes:
         changes["half_width"] = 1 / (2 * changes.pop("focal"))
     return replace(view, camera=replace(camera, **changes) if changes else camera, **response)
+
+
+def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
+    """The variable of `name`, and its change, of its value's shape, by one unit of `name`.
+
+    `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
+    or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
+    Directions, positions and cameras change by component only. Raises UsageError.
+    """
+    if name in variable_names(scene):
+        value = value_of(scene, name)
+        if components := kind_of(name).components:
+            names = ", ".join(f"{name}.{component}" for component in components)
+            raise UsageError(f"{name} changes by component: {names}")
+        return name, torch.ones_like(value)
+    owner, _, component = name.rpartition(".")
+    if owner in variable_names(scene):
+        value = value_of(scene, owner)
+        components = component_names(owner, value)
+        if component in components:
+            change = torch.zeros_like(value)
+            change[components.index(component)] = 1
+            return owner, change
+    raise UsageError(f"the scene has no number {name}")
+
+
+@contextmanager
+def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
+    """`scene` in which `name`, as for `variation`, is a dual number while the block lasts, if any.
+
+    Images of it have their derivative as a tangent. Raises UsageError.
+    """
+    if name is None:
+        yield scene
+        return
+    variable, change = variation(scene, name)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(value_of(scene, variable), change)
+        yield with_values(scene, {variable: dual})

@@ -175,7 +175,7 @@ def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
     assert f"averages {size} x {size} pixels" in told
     assert "averages" not in run("check", "auto.yaml").stdout
     x, y, z = read_scene("auto.yaml").tree.volume.resolution
-    monkeypatch.setattr("ddrecon.scene_file.box.MANY_CELLS", x * y * z // 8 + 1)
+    monkeypatch.setattr("ddrecon.scene_file.build_views.MANY_CELLS", x * y * z // 8 + 1)
     told = run("check", "auto.yaml").stderr
     assert f"{x} x {y} x {z} cells two pixels wide take hours: pictures 2 times smaller" in told
     assert told.count("take hours") == 1

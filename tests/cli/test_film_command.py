@@ -23,15 +23,13 @@ from small_scene import contents
 import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
-from ddrecon.film.drive import share_out, spread_out
-from ddrecon.film.folder import MIXED
+from ddrecon.film.drive import MIXED, share_out, spread_out
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
-from ddrecon.io.volumes.field import prune
-from ddrecon.io.volumes.table import field_names, read_field, write_field
+from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.frames import at_frame
+from ddrecon.scene_file.build_views import at_frame
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 Run = Callable[..., Result]
@@ -49,7 +47,7 @@ views:
 REST = """\
 diffusion: {model: none}
 optimize:
-  iterations: 12
+  iterations: 24
   parameters: {density: {init: 0}, lights.0.irradiance: {}, "views.*.exposure": {}}
 """
 SCATTERED = "diffusion={transport_rounds: 0}"
@@ -97,6 +95,7 @@ def whole(made: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 FEW = "-D", "optimize.iterations=6"
+ALONE = *FEW, "-D", "frames.calibrate=0"
 
 
 def volumes(folder: str) -> dict[str, bytes]:
@@ -113,49 +112,42 @@ def optimize(*arguments: str) -> tuple[str, ...]:
     return ("optimize", "film.yaml", *arguments, "-q", "--dtype", "float64")
 
 
-def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
-    longer = "-D", "optimize.iterations=24", "-D", SCATTERED
-    told = succeed(*optimize("-o", "out", "--json", "--export", "vdb", *longer)).stdout
-    record = json.loads(told)
-    assert [row["frame"] for row in record["frames"]] == list(range(FRAMES)) == list(range(4))
+def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> None:
+    out = Path(whole)
+    record = json.loads((out / "film.json").read_text())
+    assert [row["frame"] for row in record["frames"]] == list(range(FRAMES))
     assert all(1 <= row["iterations"] <= 24 for row in record["frames"])
     assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
-    assert {"report.html", "film.json", "shared.json"} <= {p.name for p in Path("out").iterdir()}
     # Its page has the volume of each frame beside its pictures.
-    page = Path("out/report.html").read_text()
+    page = (out / "report.html").read_text()
     data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)
     fields = [json.loads(text) for text in data]
-    assert [[field["name"], field["frame"]] for field in fields] == [
-        ["density", n] for n in range(4)
+    assert [(field["name"], field["frame"]) for field in fields] == [
+        ("density", n) for n in range(FRAMES)
     ]
     assert len({field["data"] for field in fields}) == 4 and len({f["white"] for f in fields}) == 1
     assert 'data-frames="[0, 1, 2, 3]"' in page and '"name": "side"' in page
     # What is shared is the same in all frames, and known for what it is.
-    shared = json.loads(Path("out/shared.json").read_text())
+    shared = json.loads((out / "shared.json").read_text())
     assert shared["frames"] == [0, 3]
     for number in range(FRAMES):
-        found = json.loads(Path(f"out/frames/{number:04d}/parameters.json").read_text())
+        found = json.loads((out / f"frames/{number:04d}/parameters.json").read_text())
         assert found["lights.0.irradiance"] == [shared["values"]["lights.0.irradiance"]]
     # The ball rises by 0.05 u a frame: so says its velocity, where there is something.
-    velocity = read_field(Path("out/frames/0003/volumes/velocity.npz"), "velocity").values
-    density = read_field(Path("out/frames/0003/volumes/density.npz"), "density").values
+    velocity, density = (
+        read_field(out / f"frames/0003/volumes/{name}.npz", name).values
+        for name in ("velocity", "density")
+    )
     mean = (velocity * density[..., None]).sum((0, 1, 2)) / density.sum()
     assert 0.03 < mean[1] < 0.07 and abs(mean[0]) < 0.02 and abs(mean[2]) < 0.02
-    for number in range(FRAMES):
-        exported = Path(f"out/sequence/film_{number:04d}.vdb")
-        assert field_names(exported) == ["density", "velocity"]
-        run = Path(f"out/frames/{number:04d}")
-        for name in field_names(exported):
-            values = read_field(run / "volumes" / f"{name}.npz", name).values
-            np.testing.assert_array_equal(read_field(exported, name).values, prune(values))
     # Each is a run as any other, and some are rendered together.
-    succeed("render", "out", "-o", "seen", "--frames", "1:2", "--view", "side")
-    succeed("render", "out/frames/0002", "-o", "one", "--view", "side")
+    succeed("render", whole, "-o", "seen", "--frames", "1:2", "--view", "side")
+    succeed("render", f"{whole}/frames/0002", "-o", "one", "--view", "side")
     assert {path.name for path in Path("seen").iterdir()} == {"0001", "0002", MANIFEST}
     np.testing.assert_array_equal(np.load("seen/0002/side.npy"), np.load("one/side.npy"))
-    load_run(Path("out/frames/0002"), lambda dtype: load_scene("out/frames/0002/scene.yaml"))
+    load_run(out / "frames/0002", lambda dtype: load_scene(out / "frames/0002/scene.yaml"))
     # Its calibration goes to another film.
-    succeed(*optimize("-o", "other", "--shared", "out/shared.json", "--frames", "2:"))
+    succeed(*optimize("-o", "other", "--shared", f"{whole}/shared.json", "--frames", "2:", *FEW))
     assert not Path("other/calibration").exists()
     assert sorted(path.name for path in Path("other/frames").iterdir()) == ["0002", "0003"]
 
@@ -163,16 +155,14 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
 def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed: Run) -> None:
     for name in VIEWS:
         np.save(f"{name}_01.npy", np.load(f"{name}_00.npy"))
-    succeed(*optimize("-o", "out", "--frames", "0:1", "-D", "frames.calibrate=0", *FEW))
+    succeed(*optimize("-o", "out", "--frames", "0:1", *ALONE))
     text = Path("film.yaml").read_text().replace("{frame:02d}", "00")
     Path("single.yaml").write_text(re.sub("frames: .*\n", "", text))
     succeed("optimize", "single.yaml", "-o", "single", "-q", "--dtype", "float64", *FEW)
-    assert (
-        volumes("single")["volumes/density.npz"]
-        == volumes("out/frames/0000")["volumes/density.npz"]
-    )
-    start, first = volumes("out/frames/0001"), volumes("out/frames/0000")
-    assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
+    first, start = volumes("out/frames/0000"), volumes("out/frames/0001")
+    density = first["volumes/density.npz"]
+    assert volumes("single")["volumes/density.npz"] == density
+    assert start["start/volumes/density.npz"] == density
 
 
 @pytest.mark.slow
@@ -191,15 +181,12 @@ def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
 def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
     """It begins from nothing, and its first frame moves as the second does."""
     for name in VIEWS:
-        for number in (8, 9):
-            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_{number - 6:02d}.npy"))
-    sizes = *FEW, "-D", "frames.calibrate=0", "-D", "frames.first=0", "-D", "frames.last=9"
-    for name in VIEWS:
-        for number in range(4, 8):
-            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_00.npy"))
-    succeed(*optimize("-o", "alone", "--frames", "8:9", *sizes))
-    for part in ("0:1", "8:9"):
-        succeed(*optimize("-o", "out", "--resume", "--frames", part, *sizes))
+        for number in range(4, 10):
+            source = number - 6 if number > 7 else 0
+            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_{source:02d}.npy"))
+    sizes = *ALONE, "-D", "frames.last=9"
+    for folder, part in (("alone", "8:9"), ("out", "0:1"), ("out", "8:9")):
+        succeed(*optimize("-o", folder, "--resume", "--frames", part, *sizes))
     out, alone = volumes("out"), volumes("alone")
     assert alone.items() <= out.items()
     assert not [file for file in out if file.startswith("frames/0008/start")]
@@ -228,18 +215,24 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 @pytest.mark.slow
-def test_killed_anywhere_and_resumed_to_the_same_bits(
+def test_killed_anywhere_and_in_parts_to_the_same_bits(
     whole: str, film: Path, succeed: Run, run: Run, killed_at: Callable[[int], None]
 ) -> None:
     """In the calibration, amid a frame, and again."""
+    first = optimize("-o", "parts", "--resume", "--frames", "0:1")
     for last in (3, 14, 5, 3):
         killed_at(last)
-        assert run(*optimize("-o", "parts", "--resume")).exit_code == 9
+        assert run(*first).exit_code == 9
     killed_at(10**6)
-    succeed(*optimize("-o", "parts", "--resume"))
+    succeed(*first)
+    for part in ("2:2", "3:"):
+        succeed(*optimize("-o", "parts", "--resume", "--frames", part))
     assert volumes("parts") == volumes(whole)
-    shared = [json.loads(Path(f"{name}/shared.json").read_text()) for name in ("parts", whole)]
+    shared = [json.loads(Path(place, "shared.json").read_text()) for place in ("parts", whole)]
     assert shared[0] == shared[1]
+    films = [json.loads(Path(place, "film.json").read_text()) for place in ("parts", whole)]
+    psnrs = [[row["psnr"] for row in record["frames"]] for record in films]
+    assert psnrs[0] == psnrs[1]
 
 
 @pytest.mark.slow
@@ -296,25 +289,15 @@ def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> No
 
 
 @pytest.mark.slow
-def test_parts_joined_are_the_whole(whole: str, film: Path, succeed: Run) -> None:
-    for part in ("0:1", "2:2", "3:"):
-        succeed(*optimize("-o", "parts", "--resume", "--frames", part))
-    assert volumes("parts") == volumes(whole)
-    frames = [json.loads(Path(f"{name}/film.json").read_text()) for name in ("parts", whole)]
-    psnrs = [[row["psnr"] for row in record["frames"]] for record in frames]
-    assert psnrs[0] == psnrs[1]
-
-
-@pytest.mark.slow
 def test_from_python(whole: str, film: Path) -> None:
     sizes = ["frames.last=1", "frames.calibrate=0", "optimize.iterations=6"]
     found = list(ddrecon.optimize_sequence("film.yaml", overrides=sizes, dtype=torch.float64))
     assert all(1 <= len(result.rows) <= 6 for result in found)
     kept = list(ddrecon.optimize_sequence(Path(whole).with_name("film.yaml"), whole))
-    assert len(kept) == FRAMES
     for number, result in enumerate(kept):
         there = read_field(Path(f"{whole}/frames/{number:04d}/volumes/density.npz"), "density")
         np.testing.assert_array_equal(result.scene.volume.density, there.values)
+    assert len(kept) == FRAMES
     with pytest.raises(ddrecon.SceneError, match="frames: missing section"):
         next(ddrecon.optimize_sequence("scene.yaml"))
 
@@ -334,60 +317,45 @@ def test_a_frame_that_fails_is_named_and_left_to_a_resume(film: Path, run: Run) 
     assert refresh not in page.read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("-D", "frames.last=-1"), "-D frames.last=-1: frames.last: must be at least 0, found -1"),
-        (
-            ("-D", "frames.first=9"),
-            "film.yaml:1:26: frames.last: 3 comes before the first frame, 9",
-        ),
-        (("-D", "frames.last=4"), "does not exist"),
-        (("--frames", "7:9"), "--frames 7:9: names no frame; expected a part of 0:3"),
-        (("--frames", "1-2"), "--frames 1-2: names no frame; expected a part of 0:3"),
-        (("--shared", "no.json"), "--shared no.json: there is no such file; a film's folder has"),
-        (("--shared", "scene.yaml"), "scene.yaml: not JSON"),
-        (("-D", "frames="), "is of a film; say which frames: {first: 0, last: 99}"),
-        (("-D", "optimize="), "none changes from frame to frame; name one, such as density"),
-        (("-D", "optimize.parameters={lights.0.irradiance: {}}"), "none changes from frame to"),
-    ],
-)
-def test_misuse_is_one_line(
-    film: Path, refuse: Refuse, arguments: tuple[str, ...], line: str
-) -> None:
-    code = 3 if "scene.yaml" in arguments else 2
-    (told, *_) = refuse(code, *optimize("-o", "out", *arguments))
-    assert line in told
+MISUSE = """
+-D frames.last=-1 => -D frames.last=-1: frames.last: must be at least 0
+-D frames.first=9 => film.yaml:1:26: frames.last: 3 comes before
+-D frames.last=4 => front_04.npy
+--frames 7:9 => --frames 7:9: names no frame
+--frames 1-2 => --frames 1-2: names no frame
+--shared no.json => --shared no.json: there is no such file
+--shared scene.yaml => scene.yaml: not JSON
+--shared strange.json => shared.json: views.top.exposure: the scene has none
+-D frames= => frames: {first: 0, last: 99}
+-D optimize= => none changes from frame to frame
+-D optimize.parameters={lights.0.irradiance:{}} => none changes from frame to frame
+"""
 
 
-def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
-    succeed(*optimize("-o", "out", "--frames", "0:0", *FEW))
-    again = run(*optimize("-o", "out"))
-    assert again.exit_code == 2 and "not empty" in again.stderr
-    Path("foreign").mkdir()
-    Path("foreign/report.html").write_text("mine")
-    foreign = run(*optimize("-o", "foreign", "--resume", *FEW))
-    assert foreign.exit_code == 2 and "which ddrecon did not write" in foreign.stderr
-    other = run(*optimize("-o", "out", "--resume", *FEW, "-D", "volume.albedo=0.5"))
-    assert (
-        other.exit_code == 2
-        and "another output folder: volume.albedo is 0.9 there, 0.5 now" in other.stderr
-    )
-    shared = json.loads(Path("out/shared.json").read_text())
-    shared["values"]["views.top.exposure"] = 1.0
-    Path("strange.json").write_text(json.dumps(shared))
-    strange = run(*optimize("-o", "new", "--shared", "strange.json"))
-    assert strange.exit_code == 2 and "views.top.exposure: the scene has none" in strange.stderr
+@pytest.mark.parametrize("row", MISUSE.strip().splitlines())
+def test_misuse_is_one_line(film: Path, run: Run, row: str) -> None:
+    arguments, _, told = row.partition(" => ")
+    Path("strange.json").write_text('{"values": {"views.top.exposure": 1.0}}')
+    result = run(*optimize("-o", "out", *arguments.replace("e:{", "e: {").split(" ", 1)))
+    assert result.exit_code == (3 if "scene.yaml" in arguments else 2)
+    assert told in result.stderr.splitlines()[0]
+
+
+def test_misuse_of_folders(whole: str, film: Path, succeed: Run, refuse: Refuse) -> None:
+    """Parts of a film are those of films, of the same film, and of its frames."""
+    shutil.copytree(whole, "whole")
+    assert "not empty" in refuse(2, *optimize("-o", "whole"))[0]
+    other = refuse(2, *optimize("-o", "whole", "--resume", "-D", "volume.albedo=0.5"))[0]
+    assert "another output folder: volume.albedo is 0.9 there, 0.5 now" in other
     for command, line in (("optimize", "is for films"), ("render", "is for the folders of films")):
-        single = run(command, "scene.yaml", "-o", "single", "--frames", "0:1")
-        assert single.exit_code == 2 and f"--frames {line}" in single.stderr
-    refused = run("export", "out", "-o", "out.vdb")
-    (advice,) = re.findall("`ddrecon (.*)`", refused.stderr)
-    assert refused.exit_code == 2
-    succeed(*advice.split(), "-q", "--frames", "0:0")
-    assert Path("out/sequence/film_0000.vdb").is_file()
-    beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
-    assert beyond.exit_code == 2 and "--frames 2:3: names no frame; expected" in beyond.stderr
+        told = refuse(2, command, "scene.yaml", "-o", "single", "--frames", "0:1")
+        assert f"--frames {line}" in told[-1]
+    assert "names no frame" in refuse(2, "render", "whole", "-o", "seen", "--frames", "7:9")[0]
+    told = refuse(2, "optimize", "scene.yaml", "-o", "whole", "--overwrite")[0]
+    assert told.startswith("whole: is the folder of another kind of job, film")
+    (advice,) = re.findall("`ddrecon (.*)`", refuse(2, "export", "whole", "-o", "out.vdb")[0])
+    succeed(*advice.split(), "-q", "--dtype", "float64", "--frames", "0:0")
+    assert Path("whole/sequence/film_0000.vdb").is_file()
 
 
 def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, succeed: Run) -> None:
@@ -395,6 +363,8 @@ def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, su
     shutil.copytree(whole, "whole")
     again = "optimize", f"{whole}/scene.yaml", "-o", "whole", "--resume", "--dtype", "float64"
     succeed(*again, "-q", "--export", "vdb", "--up", "z", "-D", "frames.fps=25")
+    names = sorted(path.name for path in Path("whole/sequence").iterdir())
+    assert names == [f"film_{number:04d}.vdb" for number in range(FRAMES)]
     exported = Path("whole/sequence/film_0002.vdb")
     by_frame, turned = (
         read_field(path, "velocity").values.astype(float)
@@ -411,37 +381,29 @@ def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, su
 
 def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refuse) -> None:
     """And nothing is touched while another process has that part, or where it is another film."""
-    few = *FEW, "-D", "frames.calibrate=0"
-    succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *few))
-    before = contents(film / "out")
-    written = {f"{place}/{n}".removeprefix("./") for place in (".", *PLACES) for n in named(place)}
+    succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *ALONE))
+    before, places = contents(film / "out"), ("frames/0000", "frames/0001")
+    written = {
+        f"{place}/{name}".removeprefix("./")
+        for place in (".", *places)
+        for name in (MANIFEST, *names_in(Path("out", place)))
+    }
     assert {name for name, data in before.items() if data is not None} <= written
-    for frame in ("0000", "0001"):
-        Path("out/frames", frame, "mine.txt").write_text("mine")
-    succeed(*optimize("-o", "out", "--frames", "1:1", "--overwrite", "--export", "npz", *few))
+    for place in places:
+        Path("out", place, "mine.txt").write_text("mine")
+    redo = optimize("-o", "out", "--frames", "1:1", "--overwrite", *ALONE)
+    succeed(*redo, "--export", "npz")
     after = contents(film / "out")
     first = [name for name in before if name.startswith("frames/0000")]
     assert {name: before[name] for name in first} == {name: after[name] for name in first}
-    assert after.keys() == before.keys() | {f"{place}/mine.txt" for place in PLACES}
+    assert after.keys() == before.keys() | {f"{place}/mine.txt" for place in places}
     assert after["frames/0001/loss.csv"] != before["frames/0001/loss.csv"]
-    redo = optimize("-o", "out", "--frames", "1:1", "--overwrite", *few)
     (line,) = refuse(2, *redo, "-D", "volume.albedo=0.5")
     assert line.startswith("out: holds another film; use another output folder: volume.albedo")
-    for lock, what in (("part.0001-0003.lock", "out"), (f"frames/0001/{LOCK}", "out/frames/0001")):
-        with hold(Path("out", lock)):
-            for how in (redo, optimize("-o", "out", "--overwrite", *few)):
-                (line,) = refuse(2, *how)
-                assert line.startswith(f"{what}: process ") and "is writing there" in line
-    (line,) = refuse(2, "optimize", "scene.yaml", "-o", "out", "--overwrite")
-    assert line.startswith("out: is the folder of another kind of job, film")
-
-
-PLACES = "frames/0000", "frames/0001"
-
-
-def named(place: str) -> list[str]:
-    """The files that the manifest in a `place` of the film `out` names, and itself."""
-    return [MANIFEST, *(name for name in names_in(Path("out", place)) if name[-1] != "/")]
+    with hold(Path("out/frames/0001", LOCK)):
+        for how in (redo, optimize("-o", "out", "--overwrite", *ALONE)):
+            (line,) = refuse(2, *how)
+            assert line.startswith("out/frames/0001: process ") and "is writing there" in line
 
 
 def test_frames_are_spread_over_all() -> None:

@@ -1,9 +1,10 @@
-"""What `ddrecon optimize` writes, and that what it writes can be used again."""
+"""What `ddrecon optimize` writes, and that what it writes can be used again; stopped, resumed."""
 
 import csv
 import json
 import math
 import re
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,13 +17,18 @@ import yaml
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.reconstruct import tuning
+from ddrecon.errors import UsageError
+from ddrecon.io.files.folders import LOCK, hold
+from ddrecon.reconstruct import recording, tuning
 from ddrecon.reconstruct.objective import Comparison
+from ddrecon.reconstruct.search import Search
+from ddrecon.run import job, quality
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
 DensityOf = Callable[[str], np.ndarray]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
+FINER = ["-D", "volume.resolution=[16, 8, 8]"]
 COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr"]
 COLUMNS += ["forward_iterations", "adjoint_iterations"]
 
@@ -32,6 +38,10 @@ def rows(folder: str) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
+def column(folder: str, name: str) -> list[int]:
+    return [int(row[name]) for row in rows(folder)]
+
+
 def read_json(path: str) -> Any:
     return json.loads(Path(path).read_text())
 
@@ -39,20 +49,27 @@ def read_json(path: str) -> Any:
 FILES = """ddrecon.manifest scene.yaml result.yaml environment.json loss.csv parameters.json
 summary.json report.html
 volumes volumes/density.npz checkpoints checkpoints/last.pt checkpoints/previous.pt previews
-previews/density.slices.png previews/front.png previews/side.png"""
+previews/density.slices.png previews/front.png previews/side.png previews/density.slices.000002.png
+previews/front.000002.png previews/side.000002.png previews/density.slices.000004.png
+previews/front.000004.png previews/side.000004.png"""
 
 
 def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     exact = "-D", "diffusion.tolerance=1e-6", "-D", "render.steps_per_voxel=1"
-    result = succeed(*OPTIMIZE, "out", "--json", *exact)
+    given = {"threads": 1, "seed": 7, "device": "cpu"}
+    options = [word for name, value in given.items() for word in (f"--{name}", str(value))]
+    options += "--preview-every", "2"
+    result = succeed(*OPTIMIZE, "out", "--json", *options, *exact)
     assert set(contents(Path("out"))) == set(FILES.split())
+    told = read_json("out/environment.json")
+    assert (given | {"torch": torch.__version__, "dtype": "float32"}).items() <= told.items()
     parameters = read_json("out/parameters.json")
     assert parameters["g"] == pytest.approx(0.3) and parameters["lights.0.irradiance"] == [3]
     assert np.shape(parameters["views.front.camera"]["matrix"]) == (4, 4)
     # The log has a row an iteration, and the summary agrees with the last.
     log, summary = rows("out"), read_json("out/summary.json")
     assert list(log[0])[: len(COLUMNS)] == COLUMNS
-    assert [int(row["iteration"]) for row in log] == [1, 2, 3, 4]
+    assert column("out", "iteration") == [1, 2, 3, 4]
     seconds = [float(row["seconds"]) for row in log]
     assert seconds == sorted(seconds) and seconds[0] > 0
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
@@ -94,22 +111,6 @@ def test_the_resolved_scene_runs_again_to_the_same_bits(
     assert scene.read_text() == Path("again/scene.yaml").read_text()
 
 
-def test_the_environment(succeed: Run) -> None:
-    given = {"threads": 1, "seed": 7, "dtype": "float64", "device": "cpu"}
-    options = [word for name, value in given.items() for word in (f"--{name}", str(value))]
-    succeed(*OPTIMIZE, "out", *options, "--iterations", "1")
-    told = read_json("out/environment.json")
-    assert (given | {"torch": torch.__version__}).items() <= told.items()
-    assert torch.get_num_threads() == 1
-
-
-def test_previews_along_the_way(succeed: Run) -> None:
-    succeed(*OPTIMIZE, "out", "--preview-every", "2")
-    names, marks = ("density.slices", "front", "side"), ("", ".000002", ".000004")
-    found = {path.stem for path in Path("out/previews").iterdir()}
-    assert found == {f"{name}{mark}" for name in names for mark in marks}
-
-
 def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
@@ -125,10 +126,10 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
 
 
 def test_overwriting_keeps_what_the_new_run_reads(
-    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+    run: Run, succeed: Run, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So it can be resumed, however soon it was stopped."""
-    succeed(*OPTIMIZE, "out")
+    """So it can be resumed, however soon it was stopped; and a scene file of the user's own."""
+    succeed(*OPTIMIZE, "out", "--iterations", "1")
 
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
@@ -142,11 +143,6 @@ def test_overwriting_keeps_what_the_new_run_reads(
     assert state["frames"][0]["total"]["iteration"] == 0  # and not that of the run before
     assert Path("out/scene.yaml").is_file() and not Path("out/result.yaml").exists()
     succeed(*again, "--resume")
-
-
-def test_a_scene_file_of_the_users_own_stays(succeed: Run, refuse: Refuse) -> None:
-    """Even where it was a run's once."""
-    succeed(*OPTIMIZE, "out", "--iterations", "1")
     with Path("out/scene.yaml").open("a") as stream:
         stream.write("# why 4 iterations are enough\n")
     for how in ("--overwrite", "--resume"):
@@ -154,46 +150,30 @@ def test_a_scene_file_of_the_users_own_stays(succeed: Run, refuse: Refuse) -> No
         assert line.startswith("out/scene.yaml: was changed and would be replaced")
 
 
-def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
-    loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
-    assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
-    assert "register: " in loud.stderr
-    assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
-
-
-def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By its lines and the curves of its report: held-out views seem to get worse there."""
+def test_a_run_tells_on_stderr_how_far_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What takes long, progress and finer cells, unless it is quiet; its time at last."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 8)
-    options = "-D", "volume.resolution=[16, 16, 16]"
-    start = time.monotonic()
+    monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
+    options, start = ("-D", "volume.resolution=[16, 16, 16]"), time.monotonic()
     told = run("optimize", "scene.yaml", "-o", "one", *options)
     taken = time.monotonic() - start
-    cells = [row["cells"] for row in rows("one")]
+    cells = column("one", "cells")
     (step,) = (i + 1 for i in range(1, 4) if cells[i] != cells[i - 1])
-    assert (
-        f"iteration {step}: 4,096 cells from here; PSNRs are of pictures as coarse" in told.stderr
-    )
+    stages = "reading pictures", "looking at what", "optimize:  "
+    stages += f"iteration {step}: 4,096 cells", "4/4", "writing what was found", "register: "
+    places = [told.stderr.index(stage) for stage in stages]
+    assert places == sorted(places) and "PSNR" in told.stderr and "optimize:" not in told.stdout
     page = Path("one/report.html").read_text()
     assert page.count('class="step"') == 2 and f"finer from there ({step})" in page
     of_all, of_iterations = (
         float(re.search(words, told.stdout).group(1))
-        for words in (r"and (\S+) s with all", r"iterations in (\S+) s")
+        for words in (r"(\S+) s in all", r"iterations in (\S+) s")
     )
     assert of_iterations < of_all <= taken + 0.1
-
-
-def test_what_takes_long_before_and_after_the_bar_is_told(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    quiet = run(*OPTIMIZE, "two")
+    assert quiet.stderr == "" and "4 iterations" in quiet.stdout
     monkeypatch.setattr("ddrecon.progress.LONG", 1e6)
     assert "..." not in run("optimize", "scene.yaml", "-o", "short").stderr
-    monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
-    told = run("optimize", "scene.yaml", "-o", "long").stderr
-    stages = ("reading pictures", "looking at what", "optimize:", "rendering what was found")
-    places = [told.index(stage) for stage in stages]
-    assert places == sorted(places) and run(*OPTIMIZE, "quiet").stderr == ""
 
 
 def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
@@ -240,8 +220,86 @@ def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.Mo
     assert ended["text"] in result.stdout.splitlines()
     assert ended["text"] in Path("out/report.html").read_text()
     assert ended["residual"] > 0 < ended["noise"]
-    assert (
-        f"off by {ended['residual']:.1%}, noise and model by {ended['noise']:.1%}" in ended["text"]
-    )
+    parts = f"off by {ended['residual']:.1%}, noise and model by {ended['noise']:.1%}"
+    assert parts in ended["text"]
     succeed(*OPTIMIZE, "out", "--resume", "--iterations", "auto")
     assert rows("out") == log
+
+
+def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int) -> None:
+    """Ctrl-C arrives once, at the end of call number `call` of `owner.name`."""
+    original, calls = getattr(owner, name), []
+
+    def pressed(*arguments: Any, **options: Any) -> Any:
+        result = original(*arguments, **options)
+        calls.append(name)
+        if len(calls) == call:
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(owner, name, pressed)
+
+
+MOMENTS = {
+    "after a render at a new resolution": (recording, "differentiate", 3),
+    "after the first step": (Search, "judge", 1),
+    "after a later step": (Search, "judge", 3),
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_an_interrupted_run_goes_on_to_the_same_bits(
+    run: Run, succeed: Run, density_of: DensityOf, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Its report is there, and says that it goes on; what is resumed is read under its lock."""
+    monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
+    monkeypatch.setattr("ddrecon.run.run_folder.PAGE_SECONDS", 0.0)
+    load, call = job.load_checkpoint, MOMENTS[moment][-1]
+
+    def load_locked(*arguments: Any) -> Any:
+        with pytest.raises(UsageError, match="is writing there"), hold(Path("parts", LOCK)):
+            pass
+        return load(*arguments)
+
+    monkeypatch.setattr(job, "load_checkpoint", load_locked)
+    succeed(*OPTIMIZE, "whole", *FINER)
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, *MOMENTS[moment])
+        result = run(*OPTIMIZE, "parts", *FINER)
+    assert (result.exit_code, result.stdout) == (130, "")
+    assert len(result.stderr.splitlines()) == 1 and "interrupted" in result.stderr
+    assert len(rows("parts")) in (call - 1, call)
+    begun = Path("parts/report.html").read_text()
+    assert "It goes on." in begun and 'http-equiv="refresh"' in begun
+    assert all(f'<section id="{name}">' in begun for name in ("volume", "loss", "views"))
+    succeed(*OPTIMIZE, "parts", *FINER, "--resume")
+    assert column("parts", "iteration") == [1, 2, 3, 4]
+    assert np.array_equal(density_of("parts"), density_of("whole"))
+    done = Path("parts/report.html").read_text()
+    assert "It goes on." not in done and 'http-equiv="refresh"' not in done
+
+
+def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, quality, "register", 1)
+        result = run(*OPTIMIZE, "out")
+    told = "interrupted after 4 iterations; write its results with --resume\n"
+    assert (result.exit_code, result.stderr) == (130, told)
+    succeed(*OPTIMIZE, "out", "--resume")
+    assert Path("out/report.html").is_file()
+
+
+def test_more_iterations_go_on_from_the_end(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the resolution that was reached, and by the folder's own scene as well."""
+    monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
+    command = [*OPTIMIZE, "out", *FINER, "--iterations"]
+    succeed(*command, "2")
+    first, reached = Path("out/loss.csv").read_text(), column("out", "cells")[-1]
+    assert reached == 16 * 8 * 8
+    succeed(*command, "4", "--resume")
+    succeed("optimize", "out/scene.yaml", "-q", "--iterations", "5", "-o", "out", "--resume")
+    assert column("out", "iteration") == [1, 2, 3, 4, 5]
+    assert set(column("out", "cells")[2:]) == {reached}
+    assert Path("out/loss.csv").read_text().startswith(first)

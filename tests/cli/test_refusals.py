@@ -33,7 +33,7 @@ render scene.yaml -o out --view back => 2 no view 'back'; the views are front, s
 render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range 2<=x
 render scene.yaml -o out --ring 99999 => 2 Error: Invalid value for '--ring': 99999 is not in the
-render scene.yaml -o out --ring 3 --fps nan => 2 Error: Invalid value for '--fps': nan is not finite
+render scene.yaml -o out --ring 3 --fps nan => 2 Error: Invalid value for '--fps': 'nan' is not a
 render scene.yaml -o out --movie m.avi => 2 --movie m.avi: expected a name that ends in .mp4 or .png
 render scene.yaml -o out --movie no/m.png => 2 no/m.png: there is no folder
 render scene.yaml -o out --movie mine.png => 2 mine.png: already there; choose another name, or

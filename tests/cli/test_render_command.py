@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 from click.testing import Result
@@ -15,6 +16,7 @@ from ddrecon.extras import advice
 from ddrecon.io.images.films import frame_times, read_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
+from ddrecon.run.render_folder import rounds_text
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
@@ -33,17 +35,15 @@ def encoded(linear: np.ndarray) -> np.ndarray:
     )
 
 
-def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run) -> None:
-    """The preview is sRGB."""
-    import imageio.v3 as iio
-
+def test_what_a_render_writes_and_says(succeed: Run) -> None:
+    """Of each view an array, a float picture and a preview in sRGB, and a record of all."""
     pytest.importorskip("OpenImageIO")
-    succeed(*RENDER)
-    assert set(contents(Path("out"))) == {
-        "ddrecon.manifest",
-        "render.json",
-        *(f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png")),
-    }
+    result = succeed(*RENDER, *ROUND, "--json", "-D", "diffusion.tolerance=1e-5")
+    report = json.loads(Path("out/render.json").read_text())
+    assert json.loads(result.stdout) == report
+    files = [f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png")]
+    assert set(contents(Path("out"))) == {"ddrecon.manifest", "render.json", *files}
+    assert sorted(file for named in report["files"].values() for file in named) == files
     for name in ("front", "side"):
         image = pixels(name)
         assert (image.shape, image.dtype) == ((6, 8, 3), np.float32)
@@ -51,6 +51,16 @@ def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run)
         assert np.array_equal(read_image(Path(f"out/{name}.exr")).pixels, image)
         preview = iio.imread(f"out/{name}.png")
         assert np.abs(preview - encoded(image.astype(float))).max() <= 1
+    assert report["seconds"]["light"] >= 0 and set(report["seconds"]["views"]) == {"front", "side"}
+    assert [
+        solve["iterations"] > 0 and solve["residual"] <= 1e-5
+        for solve in report["solves"]
+        if solve["kind"] == "forward"
+    ] == [True, True]  # diffusion's own, and that of the round
+    assert report["rounds"].keys() == {"count", "residual", "tolerance"}
+    target = np.load("front.npy").astype(float)
+    expected = 10 * np.log10(target.max() ** 2 / np.square(pixels("front") - target).mean())
+    assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
 
 
 def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
@@ -81,23 +91,6 @@ def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
     np.testing.assert_allclose(pixels("front"), image + through * behind, rtol=1e-5)
 
 
-def test_the_report(succeed: Run) -> None:
-    result = succeed(*RENDER, *ROUND, "--json", "-D", "diffusion.tolerance=1e-5")
-    report = json.loads(Path("out/render.json").read_text())
-    assert json.loads(result.stdout) == report
-    assert report["seconds"]["light"] >= 0 and set(report["seconds"]["views"]) == {"front", "side"}
-    assert [
-        solve["iterations"] > 0 and solve["residual"] <= 1e-5
-        for solve in report["solves"]
-        if solve["kind"] == "forward"
-    ] == [True, True]  # diffusion's own, and that of the round
-    named = {file for files in report["files"].values() for file in files}
-    assert named | {"ddrecon.manifest", "render.json"} == set(contents(Path("out")))
-    target = np.load("front.npy").astype(float)
-    expected = 10 * np.log10(target.max() ** 2 / np.square(pixels("front") - target).mean())
-    assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
-
-
 def test_no_exr_where_openimageio_is_not_installed(
     succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,43 +102,36 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert "no .exr" in line and "pip install" in line
 
 
-def test_the_fluence_is_a_volume_of_the_scene(succeed: Run) -> None:
-    assert "volumes/fluence.npz" in succeed(*RENDER, "--fluence").stdout
+@pytest.mark.parametrize(("said", "made"), [(0, 0), (1, 2), (3, 3)])
+def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, said: int, made: int) -> None:
+    """By two rounds at least, but none where there are to be none; in color where colors differ."""
+    rounds, scattering = "diffusion.transport_rounds=", f"volume.sigma_s={[5, 6, 7] if said else 5}"
+    told = succeed(*RENDER, "--fluence", "-D", f"{rounds}{said}", "-D", scattering).stdout
+    assert "volumes/fluence.npz" in told
     field = read_field(Path("out/volumes/fluence.npz"), "fluence")
-    expected = ddrecon.fluence(ddrecon.load_scene("scene.yaml")).permute(1, 2, 3, 0)
+    scene = ddrecon.load_scene("scene.yaml", overrides=[f"{rounds}{made}", scattering])
+    expected = ddrecon.fluence(scene).permute(1, 2, 3, 0).squeeze(-1)
     np.testing.assert_allclose(field.values, expected.numpy(), rtol=1e-4)
-    assert field.values.shape == (4, 5, 6, 3)
+    assert field.values.shape == ((4, 5, 6, 3) if said else (4, 5, 6))
     assert field.bounds is not None and field.bounds.tolist() == [[-0.5] * 3, [0.5] * 3]
-    succeed(*RENDER, "--overwrite", "--fluence", "-D", "volume.sigma_s=5", "-D", "optimize=")
-    assert read_field(Path("out/volumes/fluence.npz"), "fluence").values.shape == (4, 5, 6)
 
 
-@pytest.mark.parametrize("said", [0, 1, 3])
-def test_fluence_takes_two_rounds_at_least(succeed: Run, said: int) -> None:
-    """But none where there are to be none."""
-    rounds = f"diffusion.transport_rounds={said}"
-    succeed(*RENDER, "--fluence", "-D", rounds)
-    expected = ddrecon.load_scene("scene.yaml", overrides=[rounds.replace("1", "2")])
-    field = read_field(Path("out/volumes/fluence.npz"), "fluence")
-    fluence = ddrecon.fluence(expected).permute(1, 2, 3, 0).numpy()
-    np.testing.assert_allclose(field.values, fluence, rtol=1e-4)
-
-
-REST = [("1", "null", "what diffusion alone lacks"), ("16", "0.01", "at rest")]
-REST += [("2", "0.1", "at rest"), ("2", "1e-6", "not at rest"), ("3", "null", "at rest")]
-
-
-@pytest.mark.parametrize(("rounds", "tolerance", "verdict"), REST)
+@pytest.mark.parametrize(
+    ("count", "residual", "tolerance", "verdict"),
+    [
+        (1, 0.3, None, "what diffusion alone lacks"),
+        (3, 0.0099, None, "at rest"),
+        (3, 0.011, None, "not at rest"),
+        (1, 0.09, 0.1, "at rest"),
+        (2, 2e-6, 1e-6, "not at rest"),
+    ],
+)
 def test_it_is_said_whether_light_has_come_to_rest(
-    succeed: Run, rounds: str, tolerance: str, verdict: str
+    count: int, residual: float, tolerance: float | None, verdict: str
 ) -> None:
-    said = "-D", f"diffusion={{transport_rounds: {rounds}, transport_tolerance: {tolerance}}}"
-    out = succeed(*RENDER, "--view", "side", *said).stdout
-    report = json.loads(Path("out/render.json").read_text())["rounds"]
-    changed = f"changed light by {100 * report['residual']:.2g} %: {verdict}"
-    assert f"transport rounds: {report['count']}, the last {changed}" in out
-    least = 0.01 if tolerance == "null" else float(tolerance)
-    assert (report["residual"] < least) == (verdict == "at rest")
+    told = rounds_text(count, residual, tolerance)
+    begin = f"transport rounds: {count}, the last changed light by {100 * residual:.2g} %: "
+    assert told.startswith(begin + verdict)
 
 
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
@@ -160,34 +146,12 @@ def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     assert "neither absorbed nor left" in succeed("balance", "scene.yaml").stdout
 
 
-def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
-    import imageio.v3 as iio
-
-    said = succeed(*RENDER, "--ring", "5", "--view", "front").stdout
-    report = json.loads(Path("out/render.json").read_text())
-    movie = iio.imread("out/ring.png", index=..., plugin="pillow")[..., :3]
-    assert "movie: out/ring.png" in said and "ring_004: " in said
-    assert "... 3 views between them, in render.json" in said and "ring_003: " not in said
-    assert report["movie"]["file"] == "out/ring.png"
-    assert report["psnr"] == {}
-    assert list(report["files"]) == [f"ring_{index:03d}" for index in range(5)]
-    white = report["movie"]["white"]
-    for frame, name in zip(movie, report["files"], strict=True):
-        assert np.abs(frame - encoded(pixels(name).astype(float) / white)).max() <= 1
-    succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front")
-    assert np.allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
-
-
 def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
-    lights = [
-        "{type: ambient, radiance: 0.3}",
-        "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}",
-    ]
-    said = succeed(
-        *RENDER, *(argument for light in lights for argument in ("--light", light))
-    ).stdout
+    sky = "{type: ambient, radiance: 0.3}"
+    lamp = "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}"
+    said = succeed(*RENDER, "--light", sky, "--light", lamp).stdout
     relit = pixels("front")
-    succeed(*RENDER, "--overwrite", "-D", f"lights=[{', '.join(lights)}]")
+    succeed(*RENDER, "--overwrite", "-D", f"lights=[{sky}, {lamp}]")
     assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
 
 
@@ -215,24 +179,35 @@ def test_a_size_keeps_the_width_of_view(succeed: Run) -> None:
     assert np.allclose(taller[20:80], fine, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize("suffix", ["png", "mp4"])
-def test_a_movie_has_the_exposure_of_its_previews(succeed: Run, suffix: str) -> None:
-    import imageio.v3 as iio
-
+@pytest.mark.parametrize("movie", ["out/ring.png", "m.mp4"])
+def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch, movie: str
+) -> None:
     pytest.importorskip("imageio_ffmpeg")
-    succeed(*RENDER, "--ring", "3", "--size", "33", "21", "--movie", f"m.{suffix}", "--fps", "12")
-    if suffix == "mp4":
-        times = frame_times(Path("m.mp4"))
-        frames = [read_frame(Path("m.mp4"), number)[:21, :33] for number in range(3)]
-        assert times == pytest.approx([0, 1 / 12, 2 / 12])
+    monkeypatch.setattr("ddrecon.run.render_folder.FEW", 2)
+    options = [] if movie.startswith("out") else ["--movie", movie]
+    ring = "--ring", "4", "--view", "front", "--size", "33", "21", "--fps", "12"
+    said = succeed(*RENDER, *ROUND, *ring, *options).stdout
+    assert "transport rounds: 1, " in said
+    report = json.loads(Path("out/render.json").read_text())
+    names = [f"ring_{number:03d}" for number in range(4)]
+    assert list(report["files"]) == names and report["psnr"] == {}
+    assert report["movie"]["file"] == movie and f"movie: {movie}" in said
+    assert "... 2 views between them" in said and f"{names[2]}: " not in said
+    if movie.endswith(".mp4"):
+        assert frame_times(Path(movie)) == pytest.approx(np.arange(4) / 12)
+        frames = [read_frame(Path(movie), number)[:21, :33] for number in range(4)]
     else:
-        frames = [*iio.imread("m.png", index=..., plugin="pillow")[..., :3]]
-    previews = [iio.imread(f"out/ring_{number:03d}.png") for number in range(3)]
-    for frame, preview in zip(frames, previews, strict=True):
-        assert np.abs(frame.astype(float) - preview).mean() < (3 if suffix == "mp4" else 0.01)
-    white = json.loads(Path("out/render.json").read_text())["movie"]["white"]
-    for number, preview in enumerate(previews):
-        assert np.abs(preview - encoded(pixels(f"ring_{number:03d}") / white)).max() <= 1
+        frames = [*iio.imread(movie, index=..., plugin="pillow")[..., :3]]
+    for frame, name in zip(frames, names, strict=True):
+        preview = iio.imread(f"out/{name}.png")
+        assert np.abs(frame.astype(float) - preview).mean() < (3 if movie == "m.mp4" else 0.01)
+        exposed = encoded(pixels(name) / report["movie"]["white"])
+        assert np.abs(preview - exposed).max() <= 1
+    succeed(
+        "render", "scene.yaml", "-o", "front", "-q", "--view", "front", "--size", "33", "21", *ROUND
+    )
+    np.testing.assert_allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
 
 
 def test_a_movie_that_lacks_a_package_is_refused_before_rendering(

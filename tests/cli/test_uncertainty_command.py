@@ -1,15 +1,17 @@
 """What `ddrecon uncertainty` writes and says."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
-from small_scene import contents
-from test_resume import press_ctrl_c_in
+from click.testing import CliRunner, Result
+from small_scene import contents, write_scene
+from test_optimize_command import press_ctrl_c_in
 
+from ddrecon.cli.commands import main
 from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.uncertainty.experiments import Uncertainty
@@ -21,11 +23,20 @@ FAST = ["-D", "diffusion.model=none", "-D", "volume.sigma_s=5", "-D", "lights.1.
 KNOWN = ["-q", "-D", "optimize.noise={read: 0.05}"]
 
 
-@pytest.fixture
-def finished(folder: Path, succeed: Run) -> Path:
-    """A run that is finished, of density and two kinds of numbers."""
-    succeed("optimize", "scene.yaml", "-o", "run", "-q", *FREE.split(" ", 1), *FAST)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run that is finished, of density and two kinds of numbers."""
+    folder = tmp_path_factory.mktemp("finished")
+    scene = str(write_scene(folder))
+    command = ["optimize", scene, "-o", str(folder / "run"), "-q", *FREE.split(" ", 1), *FAST]
+    assert CliRunner().invoke(main, command).exit_code == 0
     return folder / "run"
+
+
+@pytest.fixture
+def finished(folder: Path, made: Path) -> Path:
+    """The run, in the current folder."""
+    return Path(shutil.copytree(made, folder / "run"))
 
 
 def volume(folder: str, name: str) -> np.ndarray:
@@ -33,7 +44,6 @@ def volume(folder: str, name: str) -> np.ndarray:
 
 
 def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -> None:
-    del finished
     told = succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1", "-q")
     record = json.loads(Path("sure/uncertainty.json").read_text())
     assert record["experiments"] == 1 and record["fields"]["density"]["within_1"] is None
@@ -64,7 +74,8 @@ def test_no_run_is_harmed(finished: Path, succeed: Run, refuse: Refuse) -> None:
     """Nor is a folder made where there is nothing to go on with; what was written has its names."""
     assert files_of("run") == set(names_in(finished))
     (finished / "frames").mkdir()  # which makes no film of it
-    refuse(2, "uncertainty", "run", "-o", "sure", "--resume", *KNOWN)
+    (line,) = refuse(2, "uncertainty", "run", "-o", "sure", "--resume", *KNOWN)
+    assert line.startswith("sure/checkpoints/last.pt: there is no checkpoint to resume from")
     for command in ("uncertainty run", "render scene.yaml"):
         (line,) = refuse(2, *command.split(), "-o", "run", "--overwrite", "-q")
         assert line.startswith("run: is the folder of another kind of job, run")
@@ -81,18 +92,11 @@ def files_of(folder: str) -> set[str]:
     return {name for name, data in contents(Path(folder)).items() if data} - {MANIFEST}
 
 
-def test_what_is_not_there_is_not_gone_on_with(finished: Path, refuse: Refuse) -> None:
-    del finished
-    (line,) = refuse(2, "uncertainty", "run", "-o", "gone", "--resume")
-    assert line.startswith("gone/checkpoints/last.pt: there is no checkpoint to resume from")
-
-
 @pytest.mark.slow
 def test_one_that_stops_goes_on_to_the_same_bits(
     finished: Path, run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also amid an experiment, here the second."""
-    del finished
     succeed("uncertainty", "run", "-o", "whole", *KNOWN)
     with monkeypatch.context() as context:
         press_ctrl_c_in(context, Uncertainty, "step", 6)

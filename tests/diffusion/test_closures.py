@@ -1,4 +1,4 @@
-"""Closures: D of dense media, and what replaces its infinity in empty space."""
+"""Closures: D of dense media and of empty space; means in cells and values at centers (E2.12)."""
 
 import math
 
@@ -8,9 +8,12 @@ import torch
 from media import box_grid, half_empty, random_values
 from torch import Tensor
 
+from ddrecon.diffusion.cells import average, average_cells, sharpen
 from ddrecon.diffusion.closures import CLOSURES, FLOOR, geometric, inverse_distance
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Coefficient
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.reduced import receive_light
+from ddrecon.medium.coefficients import Coefficient, Volume, scale_medium
 
 each_closure = pytest.mark.parametrize("closure", CLOSURES.values(), ids=CLOSURES.keys())
 
@@ -19,14 +22,14 @@ each_closure = pytest.mark.parametrize("closure", CLOSURES.values(), ids=CLOSURE
 def test_dense_media_have_one_third_of_the_transport_length(closure):
     kappa = torch.full((1, 2, 3, 4), 1e10, dtype=torch.float64)
     torch.testing.assert_close(
-        closure(kappa, box_grid((2, 3, 4)), FLOOR), 1 / (3 * kappa), rtol=1e-8, atol=0
+        closure(kappa, box_grid((2, 3, 4))), 1 / (3 * kappa), rtol=1e-8, atol=0
     )
 
 
 @each_closure
 def test_the_coefficient_is_positive_and_falls_with_density(closure):
     kappa = torch.logspace(-8, 8, 33, dtype=torch.float64).view(-1, 1, 1, 1).expand(-1, 2, 3, 4)
-    coefficient = closure(kappa, box_grid((2, 3, 4)), FLOOR)
+    coefficient = closure(kappa, box_grid((2, 3, 4)))
     assert bool((coefficient > 0).all()) and bool((coefficient.diff(dim=0) <= 0).all())
 
 
@@ -34,7 +37,7 @@ def test_the_coefficient_is_positive_and_falls_with_density(closure):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_empty_space_is_finite_and_has_a_finite_derivative(closure, dtype: torch.dtype):
     kappa = torch.zeros(1, 2, 3, 4, dtype=dtype, requires_grad=True)
-    coefficient = closure(kappa, box_grid((2, 3, 4)), FLOOR)
+    coefficient = closure(kappa, box_grid((2, 3, 4)))
     (slope,) = torch.autograd.grad(coefficient.sum(), kappa)
     assert bool(coefficient.isfinite().all()) and bool(slope.isfinite().all())
 
@@ -43,13 +46,13 @@ def test_empty_space_is_finite_and_has_a_finite_derivative(closure, dtype: torch
 def test_derivatives(closure):
     kappa: Tensor = (10 * half_empty(2, 2, 3, 2)).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda k: closure(k, box_grid((2, 3, 2)), FLOOR), kappa, atol=1e-8, check_forward_ad=True
+        lambda k: closure(k, box_grid((2, 3, 2))), kappa, atol=1e-8, check_forward_ad=True
     )
 
 
 def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
     grid = box_grid((2, 3, 4))
-    empty = CLOSURES["smooth"](torch.zeros(1, *grid.shape, dtype=torch.float64), grid, FLOOR)
+    empty = CLOSURES["smooth"](torch.zeros(1, *grid.shape, dtype=torch.float64), grid)
     torch.testing.assert_close(
         min(grid.extent) / (3 * empty), torch.full_like(empty, FLOOR), rtol=1e-14, atol=0
     )
@@ -82,6 +85,15 @@ def test_distances_are_those_summed_cell_by_cell():
     without_haze = Coefficient(torch.ones(()), weight - 0.03 / sum(grid.extent))
     found = inverse_distance([without_haze], grid)
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=0)
+
+
+def test_in_layers_that_repeat_the_distance_is_the_thickness_of_those_that_have_a_medium():
+    grid = Grid((4, 3, 2), (0, 0, 0), (2.0, 3.0, 1.0), periodic=(1, 2))
+    weight = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    weight[:, 1:3] = 50 * random_values(2, 3, 2)
+    found = inverse_distance([Coefficient(torch.ones(()), weight)], grid)
+    expected = torch.tensor([0.0, 1, 1, 0], dtype=torch.float64).view(1, 4, 1, 1)
+    torch.testing.assert_close(found, expected.expand_as(found), rtol=0, atol=0.01)
 
 
 def test_flat_cells_have_distances_of_their_shape():
@@ -128,3 +140,26 @@ def test_finite_differences_may_step_below_zero():
     )
     torch.testing.assert_close((above - below) / 2e-5, slope, rtol=1e-7, atol=0)
     assert bool((geometric(kappa - 0.4, box_grid((3, 4, 2))) > 0).all())
+
+
+def test_cells_receive_what_a_beam_loses_where_density_changes():
+    """In a column: E (1 - exp(-depth)), as matter times what is received, summed."""
+    grid, one = Grid((7, 1, 1), (0, 0, 0), (2.0, 1, 1)), torch.ones(1, dtype=torch.float64)
+    density = torch.tensor([0, 0, 9, 30, 0.5, 0, 0], dtype=torch.float64).view(7, 1, 1)
+    cells = average_cells(scale_medium(Volume(grid, density, 0.2 * one, 0.8 * one, 0 * one[0])))
+    light = DirectionalLight(torch.tensor([0.0, 0, -1], dtype=torch.float64), 3 * one)
+    received = 4 * math.pi * receive_light(cells, [light], 0).mean
+    lost = (cells.extinction.value * received).sum() * grid.spacing[0]
+    whole = density.sum() * grid.spacing[0]
+    torch.testing.assert_close(lost, 3 * -torch.expm1(-whole), rtol=1e-12, atol=0)
+
+
+def test_centers_of_thin_cells_are_those_whose_means_are_known():
+    """Of light that bends evenly along each axis, away from the faces of the box."""
+    grid, one = box_grid((6, 7, 5)), torch.ones(1, dtype=torch.float64)
+    z, y, x = grid.centers(one)
+    light = (2 + z - 0.3 * y + 0.5 * z**2 + 0.2 * y**2 - 0.7 * x**2)[None]
+    medium = scale_medium(Volume(grid, 0 * light[0], one, one, 0 * one[0]))
+    found = sharpen(medium, average(light))
+    inner = (slice(None), *[slice(2, -2)] * 3)
+    torch.testing.assert_close(found[inner], light[inner], rtol=1e-13, atol=0)

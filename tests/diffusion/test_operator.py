@@ -1,13 +1,23 @@
-"""The diffusion operator: a symmetric M-matrix that keeps energy, of second order."""
+"""The conservative scheme: matrix, right side and flux face by face, energy, second order."""
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import pytest
 import torch
-from manufactured import EXTENT, manufactured
-from media import box_grid, convergence_order, dense_matrix, make_operator, random_values, tensor
+from media import (
+    box_grid,
+    convergence_order,
+    dense_matrix,
+    half_empty,
+    make_operator,
+    random_values,
+    tensor,
+)
 from torch import Tensor
 
+from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import (
     AXES,
     Operator,
@@ -16,6 +26,8 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
+from ddrecon.light.moments import flux_along_axes
+from ddrecon.medium.coefficients import Volume, scale_medium
 
 SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
 
@@ -51,28 +63,21 @@ def test_the_operator_is_the_matrix_written_with_loops(operator: Operator):
     torch.testing.assert_close(operator.diagonal.flatten(1), diagonal, rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("has_outside", [False, True])
-@pytest.mark.parametrize("has_source_flux", [False, True])
-def test_energy_is_kept(
-    grid: Grid, diffusion: Tensor, absorption, operator, has_source_flux: bool, has_outside: bool
-):
-    """Absorbed plus leaked, less what came in, is what was injected: source_flux only moves."""
-    injected = random_values(2, *grid.shape, seed=5)
+def test_energy_is_kept(grid: Grid, diffusion: Tensor, absorption: Tensor, operator: Operator):
+    """Absorbed plus leaked, less what came in, is what was injected: Q1 only moves it."""
+    injected, outside = random_values(2, *grid.shape, seed=5), tensor(0.7, 1.3).view(2, 1, 1, 1)
     flux = [random_values(2, *grid.shape, seed=6 + axis) - 0.5 for axis in AXES]
-    source_flux = flux if has_source_flux else [None] * 3
-    outside = tensor(0.7, 1.3).view(2, 1, 1, 1) if has_outside else None
-    source = injected + boundary_loss(diffusion, grid) * outside if has_outside else injected
-    for axis in AXES:
-        faces = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
+    source = injected + boundary_loss(diffusion, grid) * outside
+    for axis, moved in zip(AXES, flux, strict=True):
+        faces = face_fluxes(None, moved, diffusion, grid, axis)
         source = source - faces.diff(dim=axis) / grid.spacing[axis - 1]
     u = torch.linalg.solve(dense_matrix(operator), source.flatten(1)).view_as(source)
-    volume, leaked = math.prod(grid.spacing), torch.zeros(2, dtype=torch.float64)
+    volume, leaked = math.prod(grid.spacing), tensor(0, 0)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        faces = face_fluxes(u, source_flux[axis - 1], diffusion, grid, axis, outside)
-        faces = faces.movedim(axis, 0)
+        faces = face_fluxes(u, flux[axis - 1], diffusion, grid, axis, outside).movedim(axis, 0)
         leaked += (faces[-1] - faces[0]).sum((1, 2)) * volume / step
-    absorbed, given = ((one * volume).sum((1, 2, 3)) for one in (absorption * u, injected))
-    torch.testing.assert_close(absorbed + leaked, given, rtol=1e-10, atol=0)
+    absorbed, put_in = ((power * volume).sum((1, 2, 3)) for power in (absorption * u, injected))
+    torch.testing.assert_close(absorbed + leaked, put_in, rtol=1e-10, atol=0)
 
 
 def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, diffusion: Tensor):
@@ -80,6 +85,32 @@ def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, dif
     inside = radiance.expand_as(diffusion)
     for axis in AXES:
         assert not face_fluxes(inside, None, diffusion, grid, axis, radiance).any()
+
+
+D_AT_FACES = 0.2
+EXTENT = (1.0, 1.2, 0.8)
+
+
+def manufactured(position: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """L0, D, kappa_a, kappa_s Q0, kappa_s Q1 and L1 at (z, y, x) that fulfill E2.4-E2.6.
+
+    Along each axis L0 is 1 + t (L - t) / (2 D L), so that L0 / 2 = -D dL0/dn on both faces, where D
+    is D_AT_FACES but not flat, and where Q1 runs along the face.
+    """
+    z, y, x = (axis.clone().requires_grad_() for axis in position)
+    u, bump = torch.ones_like(z), torch.ones_like(z)
+    for t, length in zip((z, y, x), EXTENT, strict=True):
+        u = u * (1 + t * (length - t) / (2 * D_AT_FACES * length))
+        bump = bump * torch.sin(math.pi * t / length)
+    diffusion, absorption = D_AT_FACES * (1 + bump), 1 + torch.cos(z) * y
+    slopes = torch.autograd.grad(u.sum(), (z, y, x), create_graph=True)
+    flux, moved, injected = [], [], absorption * u
+    for t, length, slope in zip((z, y, x), EXTENT, slopes, strict=True):
+        flux.append(torch.sin(math.pi * t / length) * (1 + x * y))
+        moved.append(diffusion * (flux[-1] - slope))
+        injected = injected + torch.autograd.grad(moved[-1].sum(), t, retain_graph=True)[0]
+    fields = [u, diffusion, absorption, injected, *flux, *(3 * component for component in moved)]
+    return tuple(field.detach()[None] for field in fields)
 
 
 def discrete_error(cells: int) -> float:
@@ -99,3 +130,96 @@ def test_a_manufactured_solution_is_approached_at_second_order():
     counts = [8, 16, 32]
     errors = [discrete_error(cells) for cells in counts]
     assert convergence_order([1 / cells for cells in counts], errors) >= 1.9, errors
+
+
+OUTSIDE = 0.7
+
+
+def make_problem(shape: tuple[int, int, int], has_flux: bool) -> DiffusionProblem:
+    """A gray medium with a beam-like source, in ambient light."""
+    sigma, g = torch.tensor([0.5, 6.0], dtype=torch.float64), 0.4 * has_flux
+    volume = Volume(box_grid(shape), half_empty(*shape), sigma[:1], sigma[1:], sigma.new_tensor(g))
+    source = random_values(4 if has_flux else 1, 1, *shape)
+    source[1:] -= 0.5
+    outside, medium = torch.full_like(source[0, :, :1, :1, :1], OUTSIDE), scale_medium(volume)
+    return DiffusionProblem(medium, lambda k: 1 / (3 * k + 0.5), source, outside, has_flux)
+
+
+class FaceByFace:
+    """Outward fluxes of a problem, F . n = `own` u(cell) + `other` u(neighbor) + `known` (E2.6)."""
+
+    def __init__(self, problem: DiffusionProblem):
+        self.problem, self.shape = problem, problem.medium.grid.shape
+        self.diffusion = problem.diffusion[0]
+        scattering = problem.medium.remaining_scattering[0]
+        self.gain = scattering * problem.source[0, 0]
+        first = (
+            problem.source[1:]
+            if len(problem.source) > 1
+            else 0 * problem.source.expand(3, -1, -1, -1, -1)
+        )
+        flux = flux_along_axes(first)
+        self.scattered = [scattering * component[0] for component in flux]
+
+    def neighbor(self, cell: tuple[int, ...], axis: int, side: int) -> tuple[int, ...] | None:
+        beside = tuple(i + side * (a == axis) for a, i in enumerate(cell))
+        return beside if 0 <= beside[axis] < self.shape[axis] else None
+
+    def flux(self, cell: tuple[int, ...], axis: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
+        h, d, q = self.problem.medium.grid.spacing[axis], self.diffusion, self.scattered[axis]
+        beside = self.neighbor(cell, axis, side)
+        if beside is None:  # Marshak's condition on the box
+            escape = 1 / (2 + h / (2 * d[cell]))
+            known = escape * (side * h / 2 * q[cell] - OUTSIDE)
+            return escape, torch.zeros_like(escape), known
+        mean = 2 / (1 / d[cell] + 1 / d[beside])
+        return mean / h, -mean / h, side * mean * (q[cell] + q[beside]) / 2
+
+    def system(self) -> tuple[Tensor, Tensor]:
+        """The matrix [n, n] and right side [n] of E2.4: outflow + kappa_a u = kappa_s Q0."""
+        number = {c: n for n, c in enumerate(itertools.product(*map(range, self.shape)))}
+        absorption, spacing = (
+            self.problem.medium.absorption.value[0],
+            self.problem.medium.grid.spacing,
+        )
+        matrix = torch.zeros(len(number), len(number), dtype=torch.float64)
+        right = self.gain.flatten().clone()
+        for cell, row in number.items():
+            matrix[row, row] += absorption[cell]
+            for axis, side in itertools.product(range(3), (-1, 1)):
+                h, (own, other, known) = spacing[axis], self.flux(cell, axis, side)
+                matrix[row, row] += own / h
+                right[row] -= known / h
+                if (beside := self.neighbor(cell, axis, side)) is not None:
+                    matrix[row, number[beside]] += other / h
+        return matrix, right
+
+    def mean_flux(self, u: Tensor, axis: int) -> Tensor:
+        """L1 = 3 F along `axis`, the mean of both faces of every cell (E2.5)."""
+        total = torch.zeros_like(u)
+        for cell, side in itertools.product(itertools.product(*map(range, self.shape)), (-1, 1)):
+            own, other, known = self.flux(cell, axis, side)
+            beside = self.neighbor(cell, axis, side)
+            outward = own * u[cell] + known + (0 if beside is None else other * u[beside])
+            total[cell] += 3 * side * outward / 2
+        return total
+
+
+@pytest.mark.parametrize("has_flux", [False, True])
+@pytest.mark.parametrize("shape", [(3, 2, 4), (1, 3, 1), (1, 1, 1)], ids=str)
+def test_the_system_is_that_put_together_face_by_face(shape: tuple[int, int, int], has_flux: bool):
+    problem = make_problem(shape, has_flux)
+    operator, right = problem.system
+    matrix, expected = FaceByFace(problem).system()
+    torch.testing.assert_close(dense_matrix(operator)[0], matrix, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(right.flatten(), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3, 2, 4), (1, 3, 1)], ids=str)
+def test_the_flux_is_that_of_each_cells_two_faces(shape: tuple[int, int, int]):
+    problem, u = make_problem(shape, True), random_values(1, *shape, seed=7)
+    found = problem.flux(u)
+    assert found is not None and math.prod(shape) == u.numel()
+    for axis, component in enumerate(flux_along_axes(found)):
+        expected = FaceByFace(problem).mean_flux(u[0], axis)
+        torch.testing.assert_close(component[0], expected, rtol=1e-12, atol=1e-12)

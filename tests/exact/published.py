@@ -47,6 +47,7 @@ PHASES: dict[str, dict[str, Any]] = {
     "isotropic": {"type": "henyey_greenstein", "g": 0.0},
     "Rayleigh": {"type": "rayleigh"},
     "g 0.75": {"type": "henyey_greenstein", "g": 0.75},
+    "backward": {"type": "henyey_greenstein", "g": -0.7},
     "haze": {"type": "two_lobe", "g": [0.824, -0.55], "weight": 0.9724},
 }
 """As in a scene file."""

@@ -1,26 +1,21 @@
 """Every scene under configs/ loads, and what it makes small is differentiated on few cells."""
 
 import importlib.util
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
-import numpy as np
 import pytest
 import torch
 from media import random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.volumes.table import write_field
 from ddrecon.picture import render
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.setup import Problem, select_views, start_parameters
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
-from ddrecon.scene_file.schema import PhaseSection
-from ddrecon.settings import DiffusionSettings, OptimizeSettings
 from ddrecon.variables.kinds import kind_of, unit_of
 from ddrecon.variables.values import variable_names, with_values
 
@@ -58,30 +53,6 @@ def test_a_kind_of_scene_renders(config: Path) -> None:
     scene = scene_at_level(scene, max(1, min(scene.volume.grid.shape) // 8))
     picture = render(scene, scene.views[0].name)
     assert bool(picture.isfinite().all()) and float(picture.min()) >= 0 < float(picture.max())
-
-
-def test_the_cloud_is_a_file_that_others_give_away(tmp_path: Path) -> None:
-    """Any .vdb does, here of a few cells."""
-    box = np.array([[-100.0, 0, -150], [100, 140, 50]])
-    write_field(tmp_path / "cloud.vdb", "density", np.ones((6, 5, 4)), box)
-    overrides = [f"volume.density.file={tmp_path}/cloud.vdb", "views.0.camera.resolution=[5, 4]"]
-    scene = load_scene(ROOT / "configs" / "cloud.yaml", overrides=overrides)
-    (picture,), sky = render(scene, "side"), scene.lights[1].radiance
-    assert torch.allclose(picture[:, 0, 0], sky)
-    assert bool((picture[:, 1, 2] > 2 * sky).all())
-
-
-def test_every_phase_function_model_and_loss_is_used() -> None:
-    """By a config, or in the measurements of the paper's g."""
-    used = [*(ROOT / "configs").rglob("*.yaml"), ROOT / "benchmarks" / "paper_g.py"]
-    text = "".join(path.read_text() for path in used).replace("=", ": ")
-    known = {f"type: {section.type}" for section in get_args(PhaseSection)}
-    for field in (*fields(DiffusionSettings), *fields(OptimizeSettings)):
-        if field.name in ("model", "loss"):
-            known |= {f"{field.name}: {choice}" for choice in field.metadata["choices"]}
-    # What scenes have that do not say.
-    by_default = {"type: henyey_greenstein", "model: p1", "loss: l2", "loss: display"}
-    assert {one for one in known if one not in text} <= by_default
 
 
 @pytest.mark.slow

@@ -218,7 +218,7 @@ def test_a_damaged_file(
     path.write_bytes(damaged(sample(suffix, is_volume)))
     # A damaged size may be a legal one: then gigabytes of zeros are read, which takes its time.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ddrecon.io.files.arrays.MAX_BYTES", 2**26)
+        patch.setattr("ddrecon.io.files.reading.MAX_BYTES", 2**26)
         is_refused(path, is_volume)
 
 
@@ -242,7 +242,7 @@ def test_what_is_too_large_is_refused_by_its_header(
     """A zip bomb among them: what its directory says is enough."""
     path = tmp_path / f"density{suffix}"
     path.write_bytes(sample(suffix, is_volume))
-    monkeypatch.setattr("ddrecon.io.files.arrays.MAX_BYTES", 100)
+    monkeypatch.setattr("ddrecon.io.files.reading.MAX_BYTES", 100)
     with pytest.raises(FormatError, match="at most"):
         read(path, is_volume)
 

@@ -7,7 +7,7 @@ import pytest
 
 from ddrecon.errors import FormatError
 from ddrecon.io.phase_files import read_phase_table
-from ddrecon.numerics.angle_table import STEPS, at_even_angles
+from ddrecon.numerics.series import STEPS, at_even_angles
 
 DEGREES = np.array([0.0, 20.0, 90.0, 150.0, 180.0])
 VALUES = np.array([[5.0, 3.0, 1.0, 0.5, 0.7], [6.0, 2.0, 1.0, 0.4, 0.6], [7.0, 1.0, 1.0, 0.3, 0.5]])

@@ -1,6 +1,5 @@
 """Adjoints are compiled beside what is done before them: each kernel once, and none in vain."""
 
-import logging
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ import torch
 
 pytest.importorskip("warp")
 
-from ddrecon.engine import LOG, use_engine
+from ddrecon.engine import use_engine
 from ddrecon.kernels import compiling
 from ddrecon.kernels import launch as launching
 from ddrecon.kernels.text import TextKernel
@@ -117,22 +116,3 @@ def test_what_another_thread_cannot_compile_is_an_error_here(
     for _ in range(2):
         with pytest.raises(OSError, match="no compiler"):
             compiling.load(kernel, "cpu")
-
-
-def test_a_line_says_once_that_kernels_are_compiled(
-    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """While the first is, at a level that Python shows unasked, and not of what is cached."""
-    use_engine("warp")
-    is_announced = threading.Semaphore(0)
-    monkeypatch.setattr(compiling, "COMPILED", 0.0)
-    replace_compiler(monkeypatch, lambda module: is_announced.acquire(timeout=60))
-    compiling._announce.cache_clear()
-    announce = compiling._announce
-    monkeypatch.setattr(compiling, "_announce", lambda: (announce(), is_announced.release()))
-    kernels = fill_kernels()
-    with caplog.at_level(logging.WARNING, LOG):
-        for kernel in (*kernels[:2], kernels[0]):
-            compiling.load(kernel.kernel, "cpu")
-    (record,) = caplog.records
-    assert "once" in record.getMessage()

@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -9,10 +10,12 @@ import pytest
 
 pytest.importorskip("warp", reason="Warp is not installed (extra `fast`)")
 from as_on_a_gpu import as_on_a_gpu
+from tape import record
 
 from ddrecon.engine import use_engine
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.recording import Replays
 
 MOST_READS, MOST_WRITES = 20, 4
 MOST_LAUNCHES = {"no round": 660, "a round": 950, "plume.yaml": 1_260}
@@ -47,3 +50,18 @@ def test_an_iteration_launches_and_waits_seldom(launches: ModuleType, case: str)
     assert counts.total("call", "launch") <= MOST_LAUNCHES[case], counts.of
     assert counts.total("read") <= MOST_READS, counts.of
     assert counts.total("write") <= MOST_WRITES, counts.of
+
+
+@pytest.mark.slow
+def test_a_recorded_iteration_reads_twice(launches: ModuleType) -> None:
+    """Losses with residuals, and the slope with what else the search decides by."""
+    use_engine("warp")
+    run = launches.begin_plume(12, 48, 1, "cpu")
+    (frame,) = run.frames
+    # A GPU takes all pixels' rays.
+    scene = frame.replays.scene
+    replays = Replays(replace(scene, render=replace(scene.render, tolerance=0)), lambda: record)
+    frame.replays = replays
+    counts = launches.count(run)
+    assert replays.recording is not None
+    assert counts.total("read") == 2 and counts.total("write") <= 2, counts.of

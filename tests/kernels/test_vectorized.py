@@ -12,12 +12,11 @@ pytest.importorskip("warp", reason="Warp is not installed (extra `fast`)")
 TESTS = Path(__file__).parents[1]
 OF_EACH_HEADER = (
     "light/test_fused_light.py::test_single_precision",
-    "light/test_fused_outgoing.py::test_light_of_any_degree[3-True]",
-    "diffusion/test_fused_cells.py::test_systems_and_fluxes_agree[True-True-(1, 1)-(5, 7, 19)]",
-    "diffusion/test_fused_passes.py::test_a_million_to_one[torch.float32-1]",
+    "light/test_fused_light.py::test_light_of_any_degree[3-True]",
+    "diffusion/test_fused_diffusion.py::test_systems_and_fluxes_agree[(5, 7, 19)-(1, 1)-True-True]",
+    "diffusion/test_fused_diffusion.py::test_a_million_to_one[1-torch.float32]",
     "march/test_faces.py::test_extended_fields_have_both_derivatives[None-warp]",
     "transport/test_fused_sweep.py::test_single_precision",
-    "kernels/test_cell_function.py::test_derivatives_are_those_of_values[Gain<1, 0, 1>]",
 )
 
 

@@ -1,4 +1,4 @@
-"""Light not yet scattered by fused kernels is torch's, in values and derivatives, also at kinks."""
+"""Light of beams, lamps and skies, and E2.3, by fused kernels is torch's, also at kinks."""
 
 import itertools
 from collections import Counter
@@ -8,31 +8,36 @@ from typing import Any
 import pytest
 import torch
 from graphics_cards import assert_compiles
-from media import half_empty, make_scene, random_values, tensor
+from media import box_grid, half_empty, make_scene, random_values, tensor
 from torch import Tensor
-from twins import Function, Tensors, assert_twins, differentiate, values_of
+from twins import Function, Tensors, assert_same, assert_twins, differentiate, values_of
 
+from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.moments import radiance_along, weigh
+from ddrecon.light.outgoing import scatter_towards
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_masses
 from ddrecon.light.sky import decompose_lights
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.kernels import text
+from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import launch
 from ddrecon.light.fused import receive
+from ddrecon.light.fused.outgoing import GIVEN, HEADER, VIEW, scatter_fused
 from ddrecon.light.fused.point_light import way_kernel
 from ddrecon.light.fused.receive import receive_kernel
 from ddrecon.light.fused.shear import _KERNELS, shear_kernel
 
 pytestmark = pytest.mark.slow
-
+Shape = tuple[int, int, int]
 DIRECTIONS = [
-    *[(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)],  # along axes
+    *[(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)],  # along axes
     *[(1.0, -1.0, 1.0), (-1.0, 0.5, 0.5), (1.0, 0.0, -1.0)],  # through centers
     *[(0.3, -0.9, 0.2), (-0.1, 0.2, -0.8), (0.9, 0.05, -0.01), (0.01, 1.0, 0.999)],
 ]
@@ -50,12 +55,11 @@ def masses_in(grid: Grid) -> Function:
     return find
 
 
-@pytest.mark.parametrize("upper", ["cubes", "boxes"])
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
-def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...], upper: str):
+def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...]):
     """Also where places lie exactly on cells' centers: there the slopes beyond them."""
-    for shape, bound in itertools.product(SHAPES, (0.0, 1.7)):
-        corner = (1.25, 1.3, 0.9) if upper == "boxes" else tuple(0.2 * cells for cells in shape)
+    for shape, bound, is_cubic in itertools.product(SHAPES, (0.0, 1.7), (True, False)):
+        corner = tuple(0.2 * cells for cells in shape) if is_cubic else (1.25, 1.3, 0.9)
         values = {"field": random_values(2, *shape), "heading": tensor(*direction)}
         values["bound"] = tensor(bound)[0]
         # In one slice all cancels, and rounding is left.
@@ -73,17 +77,17 @@ def test_rows_longer_than_a_block(along: int):
     assert_twins(masses_in(grid), values | {"bound": tensor(0.5)[0]}, 1e-11)
 
 
+# --- lights in a medium ---
+
+
 def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
     """A scene with several lights of all kinds, with a medium of `kind`."""
     density = half_empty(9, 11, 6, dtype=dtype)
-    options: dict = {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (3.0,)}
-    if kind != "gray":
-        options = {"directional": (3.0, 2.0, 1.0)}
-    if kind == "fields":
-        options |= {
-            name: 3 * random_values(3, *density.shape, seed=seed, dtype=dtype)
-            for seed, name in enumerate(("sigma_a", "sigma_s"), 1)
-        }
+    options: dict = {"directional": (3.0, 2.0, 1.0)}
+    if kind == "gray":
+        options = {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (3.0,)}
+    for seed, name in enumerate(("sigma_a", "sigma_s") if kind == "fields" else (), 1):
+        options[name] = 3 * random_values(3, *density.shape, seed=seed, dtype=dtype)
     scene = make_scene(density, g=0.4, **options)
     radiance = random_values(1 if kind == "gray" else 3, 6, 8, seed=4, dtype=dtype)
     number = density.new_tensor
@@ -114,15 +118,18 @@ NUMBERS = ["density", "sigma_a", "sigma_s", "g", "lights.0.direction", "lights.0
 NUMBERS += ["lights.1.irradiance", "lights.2.radiance", "lights.2.rotation"]
 
 
-def assert_light_twins(scene: Scene, names: list[str], degree: int, error: float = 1e-11) -> None:
+def assert_light_twins(
+    scene: Scene, degree: int, error: float = 1e-11, names: list[str] = NUMBERS
+) -> None:
     assert_twins(light_of(scene, degree), values_of(scene, names), error, least=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize(
+    ("kind", "degree"), [("gray", 0), ("colors", 1), ("fields", 1), ("gray", 3), ("fields", 3)]
+)
 def test_light_and_its_derivatives_are_those_of_torch(kind: str, degree: int):
     names = NUMBERS if degree else [name for name in NUMBERS if name != "lights.2.rotation"]
-    assert_light_twins(scene_of(kind), names, degree)
+    assert_light_twins(scene_of(kind), degree, names=names)
 
 
 POSITIONS = {
@@ -139,44 +146,113 @@ def test_point_lights_are_those_of_torch(kind: str, place: str):
     """Also where ways run through cells' centers, at which interpolation has kinks."""
     scene = scene_of(kind)
     scene.lights = [PointLight(tensor(*POSITIONS[place]), tensor(2.0)), *scene.lights]
-    assert_light_twins(scene, ["density", "sigma_a", "g", "lights.0.intensity"], 1)
+    names = ["density", "sigma_a", "g", "lights.0.intensity"]
+    assert_light_twins(scene, 1, names=names)
 
 
 def test_single_precision():
-    assert_light_twins(scene_of("fields", torch.float32), NUMBERS, 1, 2e-5)
+    assert_light_twins(scene_of("fields", torch.float32), 1, 2e-5)
 
 
-def test_sums_of_a_part_of_the_cells_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(receive, "MOST_SUMS", 1)
-    assert_light_twins(scene_of("colors"), NUMBERS, 3)
+@pytest.mark.parametrize("factor", [0.0, 1e4])
+def test_opaque_and_empty_media(factor: float):
+    scene = scene_of("colors")
+    scene.volume.density = factor * scene.volume.density
+    assert_light_twins(scene, 1, 1e-10)
 
 
 def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.MonkeyPatch):
-    """In a value, an adjoint and a tangent alike."""
+    """In a value, an adjoint and a tangent alike; sums may be of a part of the cells at a time."""
     launched: list[str] = []
 
-    def note(kernel: Any, *given: Any, **named: Any) -> None:
+    def note(kernel: Any, *arguments: Any, **named: Any) -> None:
         launched.append(kernel.key)
-        launch(kernel, *given, **named)
+        launch(kernel, *arguments, **named)
 
-    monkeypatch.setattr(text, "launch", note)
-    scene = scene_of("gray")
+    scene = scene_of("colors")
     values, marches = values_of(scene, ["density", "lights.2.radiance"]), []
+    known = differentiate("warp", light_of(scene, 3), values)
+    monkeypatch.setattr(text, "launch", note)
     for degree in (1, 3, 5):
         launched.clear()
         differentiate("warp", light_of(scene, degree), values, has_tangent=True)
         marches.append(Counter(name for name in launched if name.startswith("shear")))
     assert marches[0] and marches[0] == marches[1] == marches[2]
+    monkeypatch.setattr(receive, "MOST_SUMS", 1)
+    assert_same(differentiate("warp", light_of(scene, 3), values), known, 1e-11)
 
 
-def test_opaque_and_empty_media_have_finite_derivatives():
-    for factor in (0.0, 1e4):
-        scene = scene_of("colors")
-        scene.volume.density = factor * scene.volume.density
-        assert_light_twins(scene, NUMBERS, 1, 1e-10)
+# --- E2.3 towards a camera ---
+
+
+def make_light(shape: Shape, colors: int, degree: int) -> Tensor:
+    """phi that is dark in parts, and so directed that E2.3 is of either sign."""
+    light = random_values((degree + 1) ** 2, colors, *shape, seed=11) * half_empty(*shape, seed=2)
+    light[1:4] = 6 / 3**0.5 * (light[1:4] - 0.1)
+    light[4:] -= 0.5
+    return light
+
+
+def radiance_in(shape: Shape, is_eye: bool) -> Function:
+    """E2.3 as a function of light, g and place; the camera is an eye inside the box, or far off."""
+
+    def find(values: Tensors) -> list[Tensor]:
+        point, density = values["point"], half_empty(*shape).to(values["light"])
+        rays = Rays(point[None], -point[None], point if is_eye else None)
+        sigma = density.new_ones(1)
+        volume = Volume(box_grid(shape), density, sigma, sigma, values["g"])
+        return [scatter_towards(scale_medium(volume), values["light"], rays)]
+
+    return find
+
+
+@pytest.mark.parametrize(
+    ("shape", "g"), [((5, 7, 19), 0.4), ((5, 7, 19), -0.4), ((1, 4, 3), 0.0), ((1, 1, 1), 0.4)]
+)
+def test_radiance_and_cotangents_are_those_of_torch(shape: Shape, g: float):
+    for is_eye, degree, colors in itertools.product((False, True), (0, 1), (1, 3)):
+        values = {
+            "light": make_light(shape, colors, degree),
+            "g": tensor(g)[0],
+            "point": tensor(0.1, 0.2, 0.3) if is_eye else tensor(0.6, 0.0, 0.8),
+        }
+        assert_twins(radiance_in(shape, is_eye), values, least=1e-3)
+    single = {name: value.float() for name, value in values.items()}
+    assert_twins(radiance_in(shape, is_eye), single, 1e-5, least=1e-3)
+    # What was compared has all three parts of the bend.
+    radiance = radiance_in(shape, is_eye)(values)[0]
+    assert shape[0] < 5 or bool(((radiance > 0) & (radiance < 1e-2)).any())
+    assert shape[0] < 5 or (bool((radiance == 0).any()) and bool((radiance > 1e-2).any()))
+
+
+@pytest.mark.parametrize(
+    ("degree", "has_more"), [(1, True), (2, False), (3, True), (5, False), (7, True)]
+)
+def test_light_of_any_degree(degree: int, has_more: bool):
+    """Towards an eye inside the box, and with radiance besides, bent as a whole."""
+    shape = (3, 4, 17)
+    leaves = {"light": make_light(shape, 3, degree), "eye": tensor(0.1, 0.2, 0.3)}
+    leaves["factors"] = random_values(degree + 1, 3, 1, 1, 1, seed=7)
+    if has_more:
+        leaves["more"] = random_values(3, *shape, seed=6)
+    for leaf in leaves.values():
+        leaf.requires_grad_()
+    rays = Rays(leaves["eye"][None], -leaves["eye"][None], leaves["eye"])
+    light, grid, more = leaves["light"], box_grid(shape), leaves.get("more")
+    fused = scatter_fused(grid, light, leaves["factors"], rays, more)
+    known = radiance_along(weigh(light, leaves["factors"]), rays.towards_eye(grid), more)
+    assert has_more or bool((known == 0).any())
+    torch.testing.assert_close(fused, known, rtol=0, atol=1e-12)
+    bars = [
+        torch.autograd.grad(light, [*leaves.values()], 1 + known.detach())
+        for light in (fused, known)
+    ]
+    for one, other in zip(*bars, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11 * float(other.abs().max()))
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
-    kernels += [way_kernel(False, 32), way_kernel(True, 32), receive_kernel("tangent", 32)]
-    assert_compiles(kernels, tmp_path)
+    kernels += [way_kernel("", 32), way_kernel("long", 32), receive_kernel("tangent", 32)]
+    outgoing = RowFunction(HEADER, "Outgoing<3, 1, 1>", ((3, 1, 1, 1),), 1, VIEW, GIVEN)
+    assert_compiles([*kernels, outgoing.kernel("tangents", 17, 32)], tmp_path)

@@ -1,4 +1,4 @@
-"""What an environment map sheds: power, first moment, suns; agreement with simpler lights."""
+"""Lamps and skies: closed forms, what maps shed, and agreement with simpler lights."""
 
 import itertools
 import math
@@ -7,18 +7,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from media import half_empty, light_of, make_scene, random_values, tensor
+from media import (
+    box_grid,
+    convergence_order,
+    count_kept,
+    half_empty,
+    light_of,
+    make_camera,
+    make_scene,
+    random_values,
+    tensor,
+)
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, look_at
-from ddrecon.grid import Grid
-from ddrecon.light.environment import pixel_moments
-from ddrecon.light.lights import DirectionalLight, EnvironmentLight
+from ddrecon.grid import Grid, array_order
+from ddrecon.light.environment import (
+    environment_radiance,
+    pixel_moments,
+    refine_map,
+)
+from ddrecon.light.lights import DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.moments import flux_along_axes
+from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.light.reduced import sum_unscattered_sky
 from ddrecon.light.sky import MAX_SUNS, count_suns, decompose_map, fibonacci_sphere
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 
 SHAPE = (5, 4, 6)
 
@@ -130,20 +146,6 @@ def test_a_sky_is_the_parallel_light_of_each_of_its_pixels():
     assert relative_error(*images) < 0.05
 
 
-def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():
-    scene = make_scene(half_empty(*SHAPE), g=0.4)
-    one = random_values(3, 6, 8, seed=1)
-    other = random_values(3, 6, 8, seed=2)
-
-    def image(radiance: Tensor, scale: float) -> Tensor:
-        return render(replace(scene, lights=[light_of(radiance, scale, rotation=12.0)]))
-
-    known = 2 * image(one, 1.0) + 6 * image(other, 1.0)
-    torch.testing.assert_close(image(one + 3 * other, 2.0), known, rtol=1e-9, atol=0)
-    sunny = uneven(6, 8)
-    torch.testing.assert_close(image(sunny, 2.5), 2.5 * image(sunny, 1.0), rtol=1e-9, atol=0)
-
-
 def test_a_turned_world_looks_the_same():
     """Map, volume and camera turned by 90 degrees about +y, and so that z points up."""
     density = torch.rand(5, 4, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -165,39 +167,16 @@ def test_a_turned_world_looks_the_same():
         torch.testing.assert_close(turned, images[0], rtol=1e-9, atol=0)
 
 
-def test_more_directions_change_little():
-    scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
-    lights = (light_of(radiance, directions=count) for count in (12, 36, 108, 324))
-    images = [render(replace(scene, lights=[light])) for light in lights]
-    coarse, middle, fine = (relative_error(image, images[-1]) for image in images[:-1])
-    assert fine < middle / 2 < coarse / 4 and middle < 2e-3
-
-
-def saved_bytes(scene: Scene, directions: int) -> int:
-    """Bytes that rendering keeps for its backward pass, each storage once."""
-    storages: dict[int, int] = {}
-
-    def note(tensor: Tensor) -> Tensor:
-        if tensor.device.type == "cpu":
-            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        kept.append(tensor)
-        return tensor
-
-    kept: list[Tensor] = []
-    radiance = uneven(16, 32).requires_grad_()
-    density = scene.volume.density.clone().requires_grad_()
-    medium = scale_medium(replace(scene.volume, density=density))
-    parts = decompose_map(light_of(radiance, directions=directions))
-    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        sum_unscattered_sky(medium, parts, degree=1)
-    return sum(storages.values())
-
-
 def test_memory_does_not_grow_with_directions():
-    """But for some hundred bytes of a direction's own numbers; a field of this grid has 32 kB."""
-    scene = make_scene(random_values(16, 16, 16), g=0.3)
-    few, many = saved_bytes(scene, 12), saved_bytes(scene, 96)
-    assert many - few < 84 * 4000, (few, many)
+    density = random_values(16, 16, 16).requires_grad_()
+    medium = scale_medium(replace(make_scene(density.detach(), g=0.3).volume, density=density))
+
+    def sky(directions: int) -> Tensor:
+        parts = decompose_map(light_of(uneven(16, 32).requires_grad_(), directions=directions))
+        return sum_unscattered_sky(medium, parts, degree=1).sum()
+
+    few, many = (count_kept(lambda n=n: sky(n), density.numel()) for n in (12, 96))
+    assert few == many
 
 
 def test_under_a_black_map_images_have_finite_derivatives_by_every_number():
@@ -207,3 +186,195 @@ def test_under_a_black_map_images_have_finite_derivatives_by_every_number():
     scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light])
     slopes = torch.autograd.grad(render(scene).sum(), numbers)
     assert all(bool(torch.isfinite(slope).all()) for slope in slopes) and bool(slopes[0].any())
+
+
+SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
+
+
+def directions(count: int, seed: int = 0) -> Tensor:
+    """Unit directions (x, y, z)."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+
+
+def seen(light: EnvironmentLight, *direction: float) -> list[float]:
+    """What is seen along one direction (x, y, z), of any length."""
+    vector = torch.nn.functional.normalize(light.radiance.new_tensor(direction), dim=0)
+    return environment_radiance(light, array_order(vector)[None])[:, 0].tolist()
+
+
+def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
+    """The direction (x, y, z) of a pixel, from -z over +x around."""
+    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
+    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)
+def test_a_pixel_is_seen_in_its_direction(height: int, width: int):
+    light = light_of(random_values(2, height, width))
+    for row, column in ((1, 0), (1, width - 1), (height - 2, 1)):
+        assert seen(light, *center(row, column, height, width)) == pytest.approx(
+            light.radiance[:, row, column].tolist(), rel=1e-12
+        )
+
+
+def test_between_pixels_radiance_is_their_mean_also_across_the_seam():
+    light = light_of(random_values(1, 5, 8))
+    corners = light.radiance[0, 1:3][:, [7, 0]].mean().item()
+    assert seen(light, *center(1.5, -0.5, 5, 8)) == pytest.approx([corners], rel=1e-12)
+
+
+@pytest.mark.parametrize(("up", "way"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
+def test_straight_up_and_down_are_the_first_and_last_row(up: str, way: tuple[int, int, int]):
+    rows = torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64)
+    light = light_of(rows.view(1, 3, 1).expand(1, 3, 4), rotation=20.0, up=up)
+    assert seen(light, *way) == pytest.approx([2.0])
+    assert seen(light, *(-part for part in way)) == pytest.approx([3.0])
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
+def test_moments_integrate_the_bilinear_map(height: int, width: int):
+    """Against a sum over 300 x 600 directions."""
+    light = light_of(random_values(1, height, width))
+    rows, columns = 300, 600
+    down = math.pi * (torch.arange(rows, dtype=torch.float64) + 0.5) / rows
+    around = 2 * math.pi * (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
+    down, around = (part.flatten() for part in torch.meshgrid(down, around, indexing="ij"))
+    ways = torch.stack([down.sin() * around.sin(), down.cos(), -down.sin() * around.cos()], -1)
+    solid_angle = down.sin() * (math.pi / rows) * (2 * math.pi / columns)
+    weight = environment_radiance(light, array_order(ways))[0] * solid_angle
+    expected = torch.cat([weight.sum()[None], weight @ ways])
+    radiances = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
+    torch.testing.assert_close(radiances, expected, rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
+def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
+    radiance, ways = random_values(2, 7, 5), array_order(directions(100))
+    fine = refine_map(radiance, *size)
+    assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
+    radiances, known = (environment_radiance(light_of(one), ways) for one in (fine, radiance))
+    torch.testing.assert_close(radiances, known, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
+def test_what_is_seen_has_both_derivatives(name: str):
+    values = {"radiance": random_values(2, 4, 5), "scale": random_values()}
+    values |= {"rotation": 100 * random_values(seed=1), "direction": array_order(directions(6))}
+
+    def look(value: Tensor) -> Tensor:
+        *light, direction = (values | {name: value}).values()
+        return environment_radiance(EnvironmentLight(*light), direction)
+
+    leaf = values[name].clone().requires_grad_()
+    assert torch.autograd.gradcheck(look, leaf, check_forward_ad=True)
+
+
+def test_straight_up_has_finite_derivatives():
+    light = light_of(random_values(2, 4, 5))
+    way = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(way.detach(), torch.ones_like(way))
+        tangent = forward_ad.unpack_dual(environment_radiance(light, dual)).tangent
+    assert torch.isfinite(slope).all() and torch.isfinite(tangent).all()
+
+
+OUTSIDE, INSIDE = (0.3, 1.7, 1.1), (0.11, 0.13, 0.17)
+
+
+def light_at(position: tuple[float, ...]) -> PointLight:
+    return PointLight(tensor(*position), tensor(2.0))
+
+
+def medium_of(grid: Grid, density: Tensor, g: float = 0.4) -> Medium:
+    return scale_medium(Volume(grid, density, tensor(0.5), tensor(3.0), tensor(g)[0]))
+
+
+def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
+    """From the light to the cell centers, `[z, y, x, 3]` in array order."""
+    axes = torch.broadcast_tensors(*grid.centers(tensor(0)))
+    return torch.stack(axes, -1) - tensor(*position[::-1])
+
+
+def cell_center(grid: Grid, *cell: int) -> tuple[float, ...]:
+    """The center (x, y, z) of a cell (z, y, x)."""
+    return tuple(offsets(grid, (0.0, 0.0, 0.0))[cell].flip(0).tolist())
+
+
+@pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
+def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
+    """Everywhere but in the light's own cell."""
+    grid = box_grid((10, 12, 9))
+    empty = medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64))
+    received, offset = receive_point_light(empty, light_at(position), 1), offsets(grid, position)
+    distance = offset.norm(dim=-1)
+    is_apart = distance > max(grid.spacing)
+    expected = 2.0 / (4 * math.pi) / distance**2
+    torch.testing.assert_close(received[0, 0][is_apart], expected[is_apart], rtol=1e-13, atol=0)
+    flux, expected = (
+        torch.stack(flux_along_axes(received[1:]), -1)[0],
+        3 * (expected / distance)[..., None],
+    )
+    expected = (expected * offset)[is_apart]
+    torch.testing.assert_close(flux[is_apart], expected, rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
+def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
+    grid = box_grid((7, 6, 5))
+    even = medium_of(grid, torch.ones(grid.shape, dtype=torch.float64))
+    beam = follow_point_light(even, light_at(position))
+    for z, y, x in ((0, 0, 0), (6, 5, 4), (3, 1, 2), (6, 0, 1)):
+        end = cell_center(grid, z, y, x)[::-1]
+        start, entered = position[::-1], 0.0
+        for low, high, a, b in zip(grid.lower, grid.upper, start, end, strict=True):
+            if not low <= a <= high:
+                entered = max(entered, ((low if a < low else high) - a) / (b - a))
+        inside = (1 - entered) * math.dist(start, end)
+        assert float(beam.mass[0, z, y, x]) == pytest.approx(inside, rel=1e-12)
+
+
+def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
+    """The two ways to find depths agree as cells shrink."""
+    errors, counts = [], [8, 16, 32]
+    for count in counts:
+        grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
+        density = 8 * torch.exp(-sum(axis**2 for axis in grid.centers(tensor(0))) / 0.04)
+        scene, towards = make_scene(density, grid=grid, model="none"), tensor(0.6, 0.8, 0.0)
+        point, sun = PointLight(1e6 * towards, tensor(3e12)), DirectionalLight(-towards, tensor(3))
+        images = [render(replace(scene, lights=[light])) for light in (point, sun)]
+        errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
+    assert errors[-1] < 1e-2, errors
+    assert convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5, errors
+
+
+@pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])
+def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
+    camera = make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
+    scene = make_scene(half_empty(*SHAPE), g=0.4, camera=camera)
+    grid = scene.volume.grid
+    (z, y, x), center = grid.spacing, cell_center(grid, 2, 1, 3)
+    shifts = {"center": (0, 0, 0), "corner": (x / 2, y / 2, z / 2), "face": (0, y / 2, 0)}
+    position = {"face of the box": (0.1, 0.6, 0.1), "eye": (0.05, 0.1, 0.15)}.get(where)
+    light = light_at(position or tuple(c + s for c, s in zip(center, shifts[where], strict=True)))
+    numbers = light.position, light.intensity, scene.volume.density
+    for number in numbers:
+        number.requires_grad_()
+    image = render(replace(scene, lights=[light]))
+    assert torch.isfinite(image).all() and image.max() < 1e3
+    for slope in torch.autograd.grad(image.sum(), numbers):
+        assert bool(torch.isfinite(slope).all()) and float(slope.abs().max()) < 1e5
+
+
+def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
+    """3 / R^2, the mean of 1 / r^2 over a sphere of a cell's volume around the light; no flux."""
+    grid = box_grid((5, 4, 6))
+    empty = medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64))
+    received = receive_point_light(empty, light_at(cell_center(grid, 2, 1, 3)), 1)
+    radius = (0.75 / math.pi * math.prod(grid.spacing)) ** (1 / 3)
+    mean = 2.0 / (4 * math.pi) * 3 / radius**2
+    assert float(received[0, 0, 2, 1, 3]) == pytest.approx(mean, rel=1e-12)
+    assert float(received[1:, 0, 2, 1, 3].abs().max()) < 1e-12

@@ -1,12 +1,15 @@
-"""Fields up to the faces of the box: light that is linear is so up to there."""
+"""Fields up to the faces of the box; what a support leaves out is not walked (E10.4)."""
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import pytest
 import torch
-from media import box_grid, make_camera, march_rays, random_values
+from media import box_grid, half_empty, make_camera, make_scene, march_rays, random_values
+from scenes import VIEWS
 from torch import Tensor
+from twins import Tensors, assert_same, assert_transposes, differentiate, images_of, values_of
 
 from ddrecon.cameras import cast_rays
 from ddrecon.engine import use_engine
@@ -15,8 +18,13 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
 from ddrecon.march.faces import cells_at_faces, extend_fields, receive_at_faces, shine_through
 from ddrecon.march.outgoing import Inflow, OutgoingLight
+from ddrecon.march.samplers import planes_across, support_of_planes
+from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.picture import render
+from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
+from ddrecon.variables.values import with_values
 
 GRID = box_grid((3, 5, 4))
 TRAVEL = torch.tensor([-0.6, 0.8, 0.0], dtype=torch.float64)
@@ -41,16 +49,9 @@ def linear(*point: Tensor) -> Tensor:
     return 2 + 0.5 * point[0] - 0.7 * point[1] + 0.3 * point[2]
 
 
-CAMERAS = {
-    "straight": {"half_width": 0.1},
-    "oblique": {"eye": (0.2, 0.3, 2.5), "half_width": 0.05},
-    "inside": {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
-}
-
-
 @pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("steps", [1, 3])
-@pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize("view", [{"half_width": 0.1}, VIEWS["inside"]], ids=["far", "inside"])
 def test_linear_light_in_a_thin_medium_is_summed_exactly(engine: str, steps: int, view: dict):
     """kappa_s times the length in the box times the light in its middle."""
     use_engine(engine)
@@ -118,3 +119,85 @@ def test_extended_fields_have_both_derivatives(axis: int | None, engine: str):
     depth = TRAVEL.new_tensor(4.0)
     given = [one.requires_grad_() for one in (diffuse, *masses, direction, position, depth, got)]
     assert torch.autograd.gradcheck(extend, given, check_forward_ad=True, fast_mode=True)
+
+
+SHAPE = (7, 9, 8)
+PACKETS, RAYS = ["density", "g"], ["density", "views.view.camera"]
+TWO_STEPS, LATTICE = {"steps_per_voxel": 2}, {"tolerance": 0.05}
+
+
+def two_blobs() -> Tensor:
+    """A support that rays enter twice, or once, or not at all."""
+    support = torch.zeros(SHAPE, dtype=torch.float64)
+    support[0:2, 2:5, 2:6] = 1
+    support[5:6, 3:6, 1:4] = 1
+    return support
+
+
+def scene_with(support: Tensor | None, settings: dict, is_gray: bool = False, **view: Any) -> Scene:
+    """A scene of which density lies in `two_blobs`, whether it is told so or not."""
+    camera = make_camera(**({"size": (9, 10), "half_width": 0.4} | view))
+    density = half_empty(*SHAPE) * two_blobs()
+    medium = {"sigma_a": (1.0,), "sigma_s": (6.0,)} if is_gray else {"g": 0.5}
+    scene = make_scene(density, ambient=(0.3,), camera=camera, **medium)
+    scene.volume = replace(scene.volume, support=support)
+    scene.render = replace(RenderSettings(**settings), background=True)
+    return scene
+
+
+ENGINES = ["torch", pytest.param("warp", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("settings", [{}, TWO_STEPS, LATTICE], ids=str)
+@pytest.mark.parametrize("names", [PACKETS, RAYS], ids=["packets", "rays"])
+def test_images_and_derivatives_are_those_without_it(engine: str, settings: dict, names: list[str]):
+    """But for those by the density outside, which are 0, and changes of which nobody sees."""
+    support, size = two_blobs(), (30, 31) if settings == LATTICE else (9, 10)
+    without, within = (
+        scene_with(given, settings, names is RAYS, size=size) for given in (None, support)
+    )
+    values = values_of(within, names)
+    found = differentiate(engine, images_of(within), values, has_tangent=True)
+    assert_transposes(found, values)
+
+    def show(values: Tensors) -> list[Tensor]:
+        """Without a support, of which the density outside varies as little as with it."""
+        density = values["density"] * support + (values["density"] * (1 - support)).detach()
+        return images_of(without)(values | {"density": density})
+
+    assert_same(found, differentiate(engine, show, values, has_tangent=True), 1e-11)
+    outside = differentiate(engine, images_of(without), values)["by density"] * (1 - support)
+    assert bool(outside.any())
+
+
+def test_rays_that_miss_it_show_what_is_behind():
+    """Exactly, and what they show does not change with any cell."""
+    scene = scene_with(two_blobs(), {}, half_width=0.9)
+    image = render(scene)
+    is_behind = (image == 0.3).all(1)
+    assert bool(is_behind.any()) and not bool(is_behind.all())
+    changed = with_values(scene, {"density": scene.volume.density + 1})
+    assert torch.equal((render(changed) == 0.3).all(1), is_behind)
+
+
+@pytest.mark.slow
+def test_what_it_leaves_out_is_not_walked():
+    """By bits: none of no support, and of blobs less than half of what all cells have."""
+    pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+    from ddrecon.march.fused.cells import find_walked
+    from ddrecon.march.fused.integrate import pack_rays
+
+    scene = scene_with(two_blobs(), {}, half_width=0.6)
+    grid = scene.volume.grid
+    sight = look_through(scene.views[0].camera, grid, scene.render)
+    planes = planes_across(grid, sight.sampling, 1, torch.float64, torch.device("cpu"))
+    rays, ends = sight.rays, vars(sight.crossing).values()
+    bundle = pack_rays(grid, sight.sampling.axis, rays.origin, rays.direction, *ends).bundle
+
+    def count(support: Tensor) -> int:
+        bits = find_walked(support_of_planes(support, sight.sampling, 1), planes, bundle)
+        return sum(number.bit_count() for number in bits.flatten().tolist())
+
+    none, some, all_of_them = map(count, (torch.zeros(SHAPE), two_blobs(), torch.ones(SHAPE)))
+    assert none == 0 < some < all_of_them / 2

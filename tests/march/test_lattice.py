@@ -1,7 +1,8 @@
-"""Pixels interpolated between the rays of a lattice, against rays of their own."""
+"""What a camera's rays meet, found once; pixels interpolated between the rays of a lattice."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from media import (
@@ -9,19 +10,17 @@ from media import (
     box_grid,
     make_camera,
     make_scene,
-    march_rays,
     random_values,
 )
+from scenes import VIEWS
 from torch import Tensor
 
-from ddrecon.cameras import Rays, cast_rays
-from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
-from ddrecon.lighting import send, solve_light
-from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
 from ddrecon.march.samplers import choose_sampling
+from ddrecon.march.sight import look_through
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -31,7 +30,7 @@ CAMERAS = {
     "perspective": {},
     "against the axis": {"eye": (0.2, 0.3, -2.5)},
     "oblique": {"eye": (1.1, 0.6, 2.2)},
-    "orthographic": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
+    "orthographic": VIEWS["orthographic"],
 }
 each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
 INTERPOLATED, OWN = RenderSettings(tolerance=1.0), RenderSettings(tolerance=0.0)
@@ -85,22 +84,6 @@ def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
 
 
 @each_camera
-def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
-    """Pixels of the lattice's own rays are what marching those rays gives."""
-    scene = scene_of(view)
-    lattice = lattice_of(scene)[0]
-    outgoing = send(solve_light(scene, SolveMemory()), lattice.rays)
-    hit = cross_box(scene.volume.grid, lattice.rays).hit
-    places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
-    own_places = replace(lattice, places=places)
-    monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated = march_rays(outgoing, lattice.rays, INTERPOLATED)
-    own = march_rays(outgoing, lattice.rays, OWN)
-    for one, other in zip(interpolated, own, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
-
-
-@each_camera
 def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
     """Fewer pixels are interpolated as the tolerance falls; the RMS error stays below it."""
     scene = scene_of(view)
@@ -123,10 +106,7 @@ def test_subpixels_share_a_lattice(scene_of):
     assert float((image - own).norm() / own.norm()) < settings.tolerance
 
 
-INSIDE, GRAZING = {"eye": (0.1, 0.2, 0.15)}, {"eye": (0.9, 0.0, 0.1), "half_width": 4.0}
-
-
-@pytest.mark.parametrize("view", [INSIDE | {"half_width": 1.0}, GRAZING, {"size": (4, 5)}], ids=str)
+@pytest.mark.parametrize("view", [VIEWS["inside"], VIEWS["grazing"], {"size": (4, 5)}], ids=str)
 def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
     view: dict, scene_of
 ):
@@ -161,3 +141,56 @@ def test_rays_along_an_axis_that_miss_are_lattice_rays_in_any_unit(size: float, 
     volume = replace(scene.volume, grid=grid, density=(blob(box_grid((6, 8, 7))) / size).float())
     by_lattice, own = images(replace(scene, volume=volume))
     assert float((by_lattice - own).norm()) < 0.02 * float(own.norm())
+
+
+GRID, SETTINGS = box_grid((5, 6, 7)), RenderSettings()
+
+
+def camera_of(**kind) -> Camera:
+    return make_camera(size=(6, 7), **kind)
+
+
+def scene_seen_by(camera: Camera) -> Scene:
+    return make_scene(random_values(*GRID.shape), camera=camera, ambient=(0.3,))
+
+
+def test_a_sight_is_found_once():
+    camera = camera_of()
+    assert look_through(camera, GRID, SETTINGS) is look_through(camera, GRID, SETTINGS)
+
+
+CHANGES = {
+    "in place": lambda camera: camera.pose[:, 3].add_(0.1),
+    "in NumPy": lambda camera: np.add(camera.pose[:, 3], 0.1, out=camera.pose[:, 3].numpy()),
+    "in data": lambda camera: camera.pose.data[:, 3].add_(0.1),
+    "field of view": lambda camera: setattr(camera, "half_width", 0.5 * camera.half_width),
+    "size": lambda camera: setattr(camera, "size", (9, 8)),
+    "pose": lambda camera: setattr(camera, "pose", make_camera(eye=(1.0, 0.5, 2.0)).pose),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_a_camera_that_changed_sees_what_a_new_one_sees(change):
+    camera = camera_of()
+    render(scene_seen_by(camera))
+    change(camera)
+    assert torch.equal(render(scene_seen_by(camera)), render(scene_seen_by(replace(camera))))
+
+
+OTHERS = [(GRID, replace(SETTINGS, samples_per_pixel=4)), (GRID, replace(SETTINGS, tolerance=0.0))]
+
+
+@pytest.mark.parametrize(("grid", "settings"), [(box_grid((7, 6, 5)), SETTINGS), *OTHERS])
+def test_another_grid_or_other_settings_are_another_sight(grid, settings):
+    camera = camera_of()
+    first = look_through(camera, GRID, SETTINGS)
+    assert look_through(camera, grid, settings) is not first
+
+
+def test_a_camera_that_varies_is_seen_anew():
+    camera = camera_of()
+    scene = scene_seen_by(camera)
+    twist = value_of(scene, "views.view.camera").requires_grad_()
+    for _ in range(2):
+        image = render(with_values(scene, {"views.view.camera": twist}))
+        assert bool((torch.autograd.grad(image.sum(), twist)[0] != 0).any())

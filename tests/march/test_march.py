@@ -1,34 +1,50 @@
-"""View rays: what the box lets through and scatters towards the camera, by closed forms."""
+"""View rays: closed forms, and plain sums of E2.1 to E2.3 on other nodes."""
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
+from media import (
+    box_grid,
+    convergence_order,
+    half_empty,
+    make_camera,
+    make_scene,
+    march_rays,
+    random_values,
+    summed_series,
+    tensor,
+)
+from scenes import VIEWS
 from torch import Tensor
+from torch.nn.functional import grid_sample, pad
 
 from ddrecon.cameras import Rays, cast_rays
+from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.beam import Beam
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import follow_lights
+from ddrecon.lighting import send, solve_light
 from ddrecon.march import integral as march_module
-from ddrecon.march.box import cross_box
+from ddrecon.march.box import cross_box, intersect_box
+from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
+from ddrecon.march.samplers import choose_sampling
 from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
-CAMERAS = {
-    "perspective": {},
-    "oblique": {"eye": (1.5, 1.2, 1.8)},
-    "orthographic": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
-    "inside": {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
-    "grazing": {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
-}
-each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
+each_camera = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
 
 def emission_of(grid: Grid, density: Tensor) -> OutgoingLight:
@@ -82,7 +98,7 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
     outgoing = emission_of(grid, 0.1 + half_empty(*grid.shape))
     scattered, transmittance = march_rays(outgoing, bundle, every_ray(1))
     is_miss = chords(grid, bundle) == 0
-    assert bool(is_miss.any()) or view is CAMERAS["inside"]
+    assert bool(is_miss.any()) or view is VIEWS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
     assert bool((scattered[:, ~is_miss] > 0).all()) and bool((transmittance[:, ~is_miss] < 1).all())
 
@@ -119,37 +135,6 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
 
-THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
-
-
-def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
-    """A homogeneous slab seen straight on, along z, by a parallel camera, under parallel light."""
-    grid = Grid((cells, 2, 2), (-THICKNESS / 2, -9.0, -9.0), (THICKNESS / 2, 9.0, 9.0))
-    camera = make_camera(eye=(0.0, 0.0, 5.0), size=(1, 1), half_width=0.1, is_perspective=False)
-    density = torch.ones(grid.shape, dtype=torch.float64)
-    medium = {"sigma_a": (SIGMA_A,), "sigma_s": (SIGMA_S,), "g": g, "model": "none"}
-    return make_scene(density, grid=grid, travel=travel, camera=camera, **medium)
-
-
-@pytest.mark.parametrize(("g", "is_behind"), [(0.0, False), (-0.6, True)])
-@pytest.mark.parametrize("steps", [1, 3])
-def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool, steps: int):
-    """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L)."""
-    kappa, cosine = SIGMA_A + SIGMA_S, -1.0 if is_behind else 1.0
-    phase = (1 - g**2) / (1 + g**2 - 2 * g * cosine) ** 1.5
-    decayed = THICKNESS * math.exp(-kappa * THICKNESS)
-    if is_behind:
-        decayed = -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
-    expected = SIGMA_S * phase * 3.0 / (4 * math.pi) * decayed
-    settings = RenderSettings(steps_per_voxel=steps)
-    for cells in (2, 8):
-        image = render(replace(slab(cells, g, (0.0, 0.0, cosine)), render=settings))
-        assert float(image.mean()) == pytest.approx(expected, rel=1e-12)
-
-
-WIDTH, DENSITY = 0.1, 12.0
-
-
 def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
     """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
     absorbing = {"sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
@@ -163,19 +148,190 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
         torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
 
 
-def test_the_transmittance_of_a_blob_converges_at_second_order():
-    """A Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) at distance b."""
-    camera = make_camera(eye=(0.3, 0.4, 2.5), size=(6, 6), half_width=0.1)
-    counts, errors = [10, 20, 40], []
-    bundle = cast_rays(camera)
-    closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
-    mass = DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
-    expected = torch.exp(-SIGMA_A * mass).view(camera.size)
-    for n in counts:
-        grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
-        square = sum(axis**2 for axis in grid.centers(expected))
-        density = DENSITY * torch.exp(-square / (2 * WIDTH**2))
-        absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "ambient": (1.0,)}
-        scene = make_scene(density, grid=grid, camera=camera, directional=None, **absorbing)
-        errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
-    assert errors[-1] < 2e-3 and convergence_order([1 / n for n in counts], errors) >= 1.8, errors
+SHAPE = (5, 4, 6)
+STEPS = (1, 6, 36)
+
+
+BEAM, OTHER = (tensor(-2, -2, -1), tensor(3, 2, 1)), (tensor(1, 0.3, -0.5), tensor(1))
+LIGHTS: dict[str, list[Light]] = {
+    "two beams": [DirectionalLight(*BEAM), DirectionalLight(*OTHER)],
+    "a point outside": [PointLight(tensor(0.9, 0.8, -0.7), tensor(2))],
+    "a point inside": [PointLight(tensor(0.1, 0.2, -0.1), tensor(2, 1, 3))],
+    "a beam and ambient light": [DirectionalLight(*BEAM), AmbientLight(tensor(0.5, 0.4, 0.3))],
+    "a sky": [EnvironmentLight(random_values(3, 8, 16), tensor(20)[0], tensor(1)[0], 8)],
+}
+
+
+@pytest.fixture
+def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masses are interpolated linearly, and E8.7 is summed itself, in the fast march as well."""
+
+    def along(seen: SeenPhase, depth: Tensor | None, cosine: Tensor) -> Tensor:
+        if seen.number is not None:
+            cells = seen.phase.with_cells(seen.number.movedim(1, 0)[..., None])
+            seen = SeenPhase(cells, seen.degree)
+        elif depth is None:
+            return seen.phase.value(cosine)
+        if depth is None:
+            return seen.phase.value(cosine[..., None])[..., 0].movedim(0, 1)
+        return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
+
+    def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
+        found = along(seen, depth, angle.cos())
+        return found.movedim(0, 1) if depth is None and seen.number is None else found
+
+    monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
+    monkeypatch.setattr(SeenPhase, "along", along)
+    monkeypatch.setattr(SeenPhase, "at_angles", at_angles)
+
+
+def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scene:
+    """A random medium; under a sky alone nothing scatters twice: it is lit by all directions."""
+    model = "none" if isinstance(lights[0], EnvironmentLight) else "p1"
+    cross_sections = {"sigma_a": (0.5, 1.0, 0.2), "sigma_s": (3.0, 2.0, 1.0)}
+    settings = {"g": 0.6, "model": model, "directional": None} | cross_sections | changes
+    scene = make_scene(random_values(*SHAPE), camera=make_camera(**view), **settings)
+    return replace(scene, lights=lights)
+
+
+def march_plainly(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    """Radiance [C, R] along `rays` and transmittance [C, R] (E2.1), by so many equal steps each."""
+    grid = outgoing.grid
+    near, far = intersect_box(grid, rays)
+    part = torch.linspace(0, 1, steps + 1, dtype=near.dtype, device=near.device)
+    distance = near + part[:, None] * (far - near).clamp(min=0)
+    points = rays.origin + distance[..., None] * rays.direction
+    # What is between the camera and each node: the integral of the extinction's field, and tau.
+    fields = extend_fields(outgoing, None)
+    extinction = interpolate(grid, fields["extinction"], points)
+    passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
+    scale = outgoing.extinction.scale.view(-1, 1, 1)
+    # E2.3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
+    field = fields.get("scattering", fields["extinction"])
+    scattering = interpolate(grid, outgoing.scattering.scale * field, points)
+    by = outgoing.remaining or outgoing.scattering
+    remaining = interpolate(grid, by.scale * fields.get("remaining", field), points)
+    emitted = remaining * interpolate(grid, fields["diffuse"], points)
+    seen, number = outgoing.seen, outgoing.seen.phase.cells
+    if number is not None:
+        # The number of the phase function that differs from cell to cell, as one of each node.
+        at_nodes = interpolate(grid, fields["number"], points)
+        seen = replace(seen, phase=seen.phase.with_cells(at_nodes[..., None]))
+    for index, beam in enumerate(outgoing.beams):
+        # E2.2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
+        travel, irradiance = unattenuated(beam, points, rays.direction)
+        cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
+        mass = interpolate(grid, fields[f"mass {index}"], points)
+        if outgoing.peak is None:
+            phase = seen.phase.value(cosine[..., None])[..., 0]
+        else:
+            # E8.7: the forward peak spreads the light on its way to the node and to the camera.
+            peak = interpolate(grid, fields.get("peak", outgoing.peak), points)
+            depth = peak * (passed + mass)
+            phase = summed_series(seen, depth, cosine)
+        arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
+        emitted = emitted + scattering * phase * arriving
+    # E2.2 + E2.3: the integral of tau times that, and tau of the whole way.
+    tau = torch.exp(-scale * passed)
+    scattered = torch.trapezoid(tau * emitted, distance, dim=1)
+    return scattered, tau[:, -1].expand_as(scattered)
+
+
+def interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
+    """Of a `field` with a layer more on each side, or of one number."""
+    low, extent = points.new_tensor(grid.lower), points.new_tensor(grid.extent)
+    longer = points.new_tensor(field.shape[1:]) / points.new_tensor(grid.shape)
+    places = ((2 * (points - low) / extent - 1) / longer).flip(-1)
+    ways = {"padding_mode": "border", "align_corners": False}
+    return grid_sample(field[None], places[None, None], **ways)[0, :, 0]
+
+
+def unattenuated(
+    beam: Beam | PointBeam, points: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    if isinstance(beam, Beam):
+        return beam.direction, beam.irradiance[..., 0]
+    offset = points - beam.position
+    along = (offset * direction).sum(-1)
+    square = along**2 + (offset.square().sum(-1) - along**2).clamp(min=beam.least_square)
+    return offset / square.sqrt()[..., None], beam.irradiance[..., 0] / square
+
+
+def emit(scene: Scene) -> tuple[OutgoingLight, Rays]:
+    rays = cast_rays(scene.views[0].camera)
+    return send(solve_light(scene, SolveMemory()), rays), rays
+
+
+def march_fast(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    return march_rays(outgoing, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
+
+
+def march_twin(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    return march_plainly(outgoing, rays, 12 * steps)
+
+
+def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
+    """How far apart the two marches' `of(marcher, steps)` are, relative to the norm, at STEPS."""
+    apart = []
+    for steps in STEPS:
+        pairs = zip(of(march_fast, steps), of(march_twin, steps), strict=True)
+        apart.append([float((fast - plain).norm() / plain.norm()) for fast, plain in pairs])
+    return [list(errors) for errors in zip(*apart, strict=True)]
+
+
+def assert_order(errors: list[float], finest: float, order: float = 1.7) -> None:
+    assert errors[-1] < finest, errors
+    assert convergence_order([1 / steps for steps in STEPS], errors) > order, errors
+
+
+CROSS_SECTION = random_values(3, *SHAPE, seed=7)
+MEDIA: dict[str, dict[str, Any]] = {
+    "isotropic": {"g": 0.0},
+    "backward": {"g": -0.4},
+    "scattering varies": {"sigma_s": CROSS_SECTION},
+    "absorption varies": {"sigma_a": CROSS_SECTION, "g": 0.0},
+}
+PHASES: dict[str, PhaseFunction] = {
+    "g varies": HenyeyGreenstein(1.2 * random_values(*SHAPE, seed=8) - 0.4),
+    "weight varies": TwoLobe(tensor(0.6, -0.3), random_values(*SHAPE, seed=9)),
+}
+CASES = [(light, "inside" if "point" in light else "oblique", "") for light in LIGHTS]
+CASES += [("two beams", view, "") for view in ("perspective", "orthographic", "inside")]
+CASES += [("two beams", "oblique", medium) for medium in [*MEDIA, *PHASES]]
+CASES += [("a point inside", "oblique", phase) for phase in PHASES]
+
+
+@pytest.mark.parametrize(("lights", "view", "medium"), CASES)
+@pytest.mark.usefixtures("same_fields")
+def test_images_agree_in_the_limit(lights: str, view: str, medium: str):
+    scene = lit_scene(LIGHTS[lights], VIEWS[view], **MEDIA.get(medium, {}))
+    scene.volume.phase = PHASES.get(medium, scene.volume.phase)
+    outgoing, rays = emit(scene)
+    for errors in differences(lambda marcher, steps: list(marcher(outgoing, rays, steps))):
+        assert_order(errors, 1e-3, 1.6)
+
+
+def test_they_agree_with_finer_cells_whatever_is_interpolated():
+    """Masses to third order or linearly, E8.7 by a table or itself: in a smooth medium."""
+    errors = []
+    for count in (8, 16, 32):
+        scene = lit_scene(LIGHTS["two beams"][:1], VIEWS["oblique"], g=0.3, model="none")
+        axes = [torch.linspace(-1, 1, count + 1)[1:] - 1 / count for _ in range(3)]
+        z, y, x = torch.meshgrid(*axes, indexing="ij")
+        density = 2 * torch.exp(-2 * (x**2 + y**2 + z**2)).double()
+        grid = replace(scene.volume.grid, shape=density.shape)
+        volume = replace(scene.volume, density=density, grid=grid)
+        outgoing, rays = emit(replace(scene, volume=volume))
+        fast, plain = march_fast(outgoing, rays, 4)[0], march_twin(outgoing, rays, 16)[0]
+        errors.append(float((fast - plain).norm() / plain.norm()))
+    assert errors[-1] < 2e-3 and convergence_order([1 / 8, 1 / 16, 1 / 32], errors) > 1.5, errors
+
+
+def test_rounding_does_not_choose_between_axes() -> None:
+    """Seen at 45 degrees two axes are crossed equally fast: slices lie across the first of them."""
+    grid = Grid((6, 6, 6), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    rays = cast_rays(make_camera(eye=(2.5, 0.0, 2.5), half_width=0.2))
+    for _ in range(8):
+        noise = 1 + 1e-15 * torch.randn(3, dtype=torch.float64)
+        bundle = replace(rays, direction=rays.direction * noise)
+        assert choose_sampling(grid, bundle, cross_box(grid, bundle)).axis == 0

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from ddrecon.pictures.noise import LEAST, Noise, estimate_noise
-from ddrecon.pictures.scales import Stabilized
-from ddrecon.pictures.similarity import DEVIATION, K1, K2, RADIUS, structural_similarity
+from ddrecon.pictures.scales import DEVIATION, K1, K2, RADIUS, Stabilized, structural_similarity
 from ddrecon.pictures.srgb import display, display_slope
 
 

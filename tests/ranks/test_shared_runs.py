@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddrecon.run.checkpoint import load_checkpoint
+from ddrecon.run.job import load_checkpoint
 
 pytestmark = pytest.mark.slow
 Job = dict[str, Any]

@@ -6,14 +6,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
+from ddrecon import load_scene
 from ddrecon.errors import DivergenceError, FormatError, SceneError, SolveError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct import loop, tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame
 from ddrecon.reconstruct.gradients import Differentiated
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.run.checkpoint import FORMAT, load_checkpoint
+from ddrecon.run.job import FORMAT, load_checkpoint
 from ddrecon.scene import Scene, View
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
@@ -114,7 +118,7 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(
 ) -> None:
     run, failed = Reconstruction(ball_scene), list[str]()
     run.step()
-    candidate, evaluate = run.search.candidate()["density"], Frame.evaluate
+    candidate, evaluate = run.search.candidate["density"], Frame.evaluate
 
     def fail_once(frame: Frame) -> Evaluation:
         if not failed:
@@ -134,7 +138,7 @@ def test_a_candidate_that_is_refused_is_logged_and_not_kept(
     run = Reconstruction(ball_scene)
     row, before = run.step(), run.parameters[0].value.detach().clone()
     # A step so long that all is fog.
-    run.search.step *= 1e3
+    run.search._set_out(1e3 * run.search.step)
     refused = run.step()
     assert refused.loss > row.loss and refused.iteration == run.total.iteration == 2
     assert torch.equal(run.parameters[0].value, before)
@@ -147,3 +151,69 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
         Reconstruction(replace(ball_scene, views=tests))
     with pytest.raises(SceneError, match="missing section"):
         Reconstruction(replace(ball_scene, optimize=None))
+
+
+@pytest.mark.parametrize("fewest", [16, 8, 4])
+def test_a_line_through_two_resolutions(
+    ball_scene, monkeypatch: pytest.MonkeyPatch, fewest: int
+) -> None:
+    """By a clock that counts 0.25 s and a millisecond a cell; twice that the first time."""
+    monkeypatch.setattr(tuning, "FEWEST_CELLS", fewest)
+    clock, known, evaluate = [0.0], set[int](), Frame.evaluate
+
+    def evaluate_slowly(frame: Frame) -> Evaluation:
+        cells = frame.level.train.volume.grid.cells
+        clock[0] += (0.25 + cells / 1000) * (1 if cells in known else 2)
+        known.add(cells)
+        return evaluate(frame)
+
+    monkeypatch.setattr(Frame, "evaluate", evaluate_slowly)
+    monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
+    cells = ball_scene.volume.grid.cells
+    assert loop.time_iteration(ball_scene) == pytest.approx(0.25 + cells / 1000)
+    assert len(known) == (1 if fewest == 16 else 2)
+
+
+NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
+
+
+@pytest.fixture
+def still() -> Scene:
+    """The ball, with numbers to find beside its density, in float64; cameras need more pictures."""
+    sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
+    overrides = ["optimize.iterations=4", "diffusion.transport_rounds=0", *sought]
+    scene = load_scene("configs/ball.yaml", overrides=overrides, dtype=torch.float64)
+    return scene_at_level(scene, 2)
+
+
+def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
+    return {p.name: p.value.detach() for p in run.parameters}
+
+
+@pytest.mark.slow
+def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
+    single, together = Reconstruction(still), Reconstruction(still, others=[still])
+    while not single.is_done:
+        row, rows = single.step(), together.advance()
+        assert [other.loss for other in rows] == pytest.approx([row.loss] * 2, rel=1e-6)
+    assert together.is_done
+    for run in together.frames:
+        torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
+    other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
+    together = Reconstruction(still, others=[other])
+    together.advance()
+    state = together.state()
+    rows = together.advance()
+    one, two = map(values, together.frames)
+    for name in one:
+        assert torch.equal(one[name], two[name]) == (name != "density")
+    # It goes on from its state to the same bits.
+    again = Reconstruction(still, others=[other])
+    again.restore(state)
+    assert [row.loss for row in again.advance()] == [row.loss for row in rows]
+    for run, resumed in zip(together.frames, again.frames, strict=True):
+        torch.testing.assert_close(values(resumed), values(run), rtol=0, atol=0)

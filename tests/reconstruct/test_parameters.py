@@ -1,13 +1,15 @@
 """Parameters: their smoothing, their bounds, and what they keep at a finer resolution."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, random_values
+from media import box_grid, make_scene, random_values
 
+from ddrecon.grid import Grid
 from ddrecon.reconstruct.levels import resample
-from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.parameters import Parameter, face_stiffness, total_variation
 from ddrecon.settings import ParameterSettings
 
 GRID = box_grid((4, 6, 5))
@@ -34,6 +36,21 @@ def test_a_direction_keeps_its_length() -> None:
     assert float(moved.norm()) == pytest.approx(3.0)
 
 
+def test_what_a_move_changes_is_the_same_at_a_finer_resolution() -> None:
+    """The product of a move and of a change of the derivative, but for the blur of both."""
+
+    def miss(cells: int) -> float:
+        grid, finer = box_grid((cells, 2, 3)), box_grid((2 * cells, 4, 5))
+        place = (torch.arange(cells).double() + 0.5) / cells
+        move, slope = (w[:, None, None].expand(grid.shape) for w in (place.sin(), place.exp()))
+        parameter = Parameter("density", ParameterSettings(), move, grid)
+        parameter.refine(finer)
+        product = (parameter.carry(move, False) * parameter.carry(slope, True)).sum()
+        return abs(float(product / (move * slope).sum()) - 1)
+
+    assert miss(16) > 3.5 * miss(32) > 0
+
+
 def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order() -> None:
     """Interpolation alone blurs by the second power of a cell's width."""
 
@@ -46,3 +63,90 @@ def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order() -> None:
         return float((resample(parameter.value.detach(), grid) - wave).abs().max())
 
     assert lost(16) > 14 * lost(32) > 0
+
+
+def box(cells: int, side: float = 1.0) -> Grid:
+    return Grid((cells,) * 3, (0.0,) * 3, (side,) * 3)
+
+
+@pytest.mark.parametrize("cells", [8, 16, 32])
+def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells: int) -> None:
+    grid = box(cells)
+    ramp = 2 * grid.centers(torch.zeros(1, dtype=torch.float64))[2].expand(*grid.shape)
+    inner = (cells - 1) / cells
+    assert float(total_variation(ramp, grid)) == pytest.approx(2 * inner, rel=0.01)
+
+
+def test_total_variation_does_not_depend_on_world_scale() -> None:
+    field = random_values(6, 6, 6)
+    one, other = (float(total_variation(field, box(6, side))) for side in (1.0, 7.0))
+    assert one == pytest.approx(other, rel=1e-12)
+
+
+@pytest.mark.parametrize("knee", [None, 0.1])
+def test_total_variation_has_a_finite_derivative_where_flat(knee: float | None) -> None:
+    field = torch.zeros(4, 4, 4, requires_grad=True)
+    total_variation(field, box(4), knee).backward()
+    assert torch.isfinite(field.grad).all()
+
+
+def test_a_knee_compresses_densities_above_it() -> None:
+    """By log(1 + x / knee) / 3; the derivative is exact."""
+    field, grid = random_values(3, 4, 5).requires_grad_(), Grid((3, 4, 5), (0, 0, 0), (1, 1, 1))
+    compressed = total_variation((1 + field / 0.1).log() / 3, grid)
+    torch.testing.assert_close(total_variation(field, grid, 0.1), compressed)
+    assert torch.autograd.gradcheck(lambda x: total_variation(x, grid, 0.1), field)
+
+
+def stiffness_matrix(field: torch.Tensor, grid: Grid, knee: float | None) -> torch.Tensor:
+    """R, column by column."""
+    faces, slope = face_stiffness(field, grid, knee)
+    slope = torch.ones_like(field) if slope is None else slope
+    columns = []
+    for entry in torch.eye(field.numel()).double().view(-1, *field.shape):
+        total, x = torch.zeros_like(field), entry * slope
+        for axis, face in enumerate(faces, -3):
+            flow = face * (x.roll(-1, axis) - x)
+            total += flow.roll(1, axis) - flow
+        columns.append((total * slope).flatten())
+    return torch.stack(columns, 1)
+
+
+@pytest.mark.parametrize("periodic", [(), (0, 2)])
+def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(
+    periodic: tuple[int, ...],
+) -> None:
+    field = random_values(4, 3, 5)
+    grid = replace(make_scene(field).volume.grid, periodic=periodic)
+    stiffness = stiffness_matrix(field, grid, None)
+    field.requires_grad_()
+    variation = total_variation(field, grid)
+    (slope,) = torch.autograd.grad(variation, field)
+    for seed in range(40):
+        for size in (-1.0, 0.3, 2.0):
+            step = size * (random_values(*field.shape, seed=seed) - 0.5).flatten()
+            parabola = variation + slope.flatten() @ step + step @ stiffness @ step / 2
+            assert total_variation(field + step.view_as(field), grid) <= parabola + 1e-12
+
+
+def test_smoothing_does_not_depend_on_where_a_period_begins() -> None:
+    field, shift = random_values(4, 3, 5), (1, 2)
+    grid = replace(make_scene(field).volume.grid, periodic=(0, 2))
+    moved = field.roll(shift, (0, 2))
+    torch.testing.assert_close(total_variation(moved, grid), total_variation(field, grid))
+    for there, here in zip(
+        face_stiffness(moved, grid)[0], face_stiffness(field, grid)[0], strict=True
+    ):
+        torch.testing.assert_close(there, here.roll(shift, (0, 2)))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.05, 2.0])
+def test_stiffness_is_the_curvature_of_an_even_density(density: float) -> None:
+    field = torch.full((3, 4, 5), density, dtype=torch.float64)
+    grid = make_scene(field).volume.grid
+
+    def variation(x: torch.Tensor) -> torch.Tensor:
+        return total_variation(x.view(3, 4, 5), grid, 0.1)
+
+    curvature = torch.autograd.functional.hessian(variation, field.flatten())
+    torch.testing.assert_close(stiffness_matrix(field, grid, 0.1), curvature)

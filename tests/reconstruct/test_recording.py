@@ -1,5 +1,6 @@
 """A recorded iteration is the plain one, whatever the values are by then."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import LOG, use_engine
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.recording import Recording, Replays
 from ddrecon.scene import Scene
@@ -64,7 +66,7 @@ def test_replays_are_plain_iterations(scene: Scene) -> None:
     for factor, names in ((1.0, ["one", "two"]), (0.9, ["two", "one"]), (1.1, ["three"])):
         values, compared = leaves_of(scene, factor), compare(scene, *names)
         objective = recording.replay(values, compared, memory)
-        assert objective is not None
+        assert compared.read(objective, objective.loss, []) is not None
         assert_same(objective, differentiate_plainly(scene, values, *names))
         assert list(compared.pictures) == names
 
@@ -72,14 +74,16 @@ def test_replays_are_plain_iterations(scene: Scene) -> None:
 def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
     memory = SolveMemory()
     differentiate(scene, ["one"], leaves_of(scene), compare(scene, "one"), memory)
-    memory.iterations = dict.fromkeys(memory.iterations, 0)
-    recording = Recording(scene, leaves_of(scene), memory, record)
-    assert recording.replay(leaves_of(scene, 0.5), compare(scene, "one"), memory) is None
+    memory.iterations = dict.fromkeys(memory.iterations, 1)
     replays = Replays(scene, lambda: record)
     values, compared = leaves_of(scene, 0.5), compare(scene, "one")
     objective = replays.differentiate(values, compared, memory)
+    assert objective.residuals and compared.read(objective, objective.loss, []) is None
+    replays.forget(compared, memory)
+    objective = replays.differentiate(values, compared, memory)
+    assert not objective.residuals
     assert_same(objective, differentiate_plainly(scene, values, "one"))
-    assert len(compared.metrics["psnr"]) == 1
+    assert len(compared.psnrs) == 1
 
 
 def test_what_cannot_be_recorded_runs_plainly(
@@ -96,3 +100,24 @@ def test_what_cannot_be_recorded_runs_plainly(
     assert replays.new_recorder is None
     assert "without CUDA graphs" in caplog.text
     assert_same(objective, differentiate_plainly(scene, values, "one"))
+
+
+@pytest.mark.slow
+def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene: Scene) -> None:
+    """It records anew what the whole run has recorded before."""
+    use_engine("warp")
+    render = replace(ball_scene.render, tolerance=0)
+    whole, resumed = (Reconstruction(replace(ball_scene, render=render)) for _ in range(2))
+
+    def advance(run: Reconstruction, count: int) -> None:
+        (frame,) = run.frames
+        for _ in range(count):
+            frame.replays.new_recorder = lambda: record
+            run.step()
+
+    advance(whole, 3)
+    resumed.restore(copy.deepcopy(whole.state()))
+    for run in (whole, resumed):
+        advance(run, 2)
+        assert run.frames[0].replays.recording is not None
+    assert torch.equal(whole.parameters[0].value, resumed.parameters[0].value)

@@ -9,10 +9,11 @@ import pytest
 import torch
 from media import box_grid
 
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, Stage, find_stages
-from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST, UNLIKE
+from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST
 from ddrecon.scene import Scene
 from ddrecon.settings import AUTO, ParameterSettings
 
@@ -85,24 +86,25 @@ def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("others", "is_lit", "waiting"),
+    ("others", "lights", "waiting"),
     [
-        (["density"], True, {"emission", "g"}),
-        (["density"], False, {"g"}),
-        ([], True, {"g"}),
+        (["density"], [AmbientLight(torch.ones(1))], {"emission", "g"}),
+        (["density"], [DirectionalLight(torch.ones(3), torch.ones(1))], {"emission", "g"}),
+        (["density"], [], {"g"}),
+        ([], [AmbientLight(torch.ones(1))], {"g"}),
     ],
 )
 def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
-    ball_scene: Scene, others: list[str], is_lit: bool, waiting: set[str]
+    ball_scene: Scene, others: list[str], lights: list[Light], waiting: set[str]
 ) -> None:
-    """In the dark, or alone, glow is all that pictures can show."""
-    grid, scene = box_grid((4, 4, 4)), replace(ball_scene)
-    scene.lights = scene.lights if is_lit else []
+    """In the dark, or alone, glow is all that pictures can show; light from one side tells all."""
+    grid, scene = box_grid((4, 4, 4)), replace(ball_scene, lights=lights)
     empty = torch.zeros(grid.shape)
     values = dict.fromkeys([*others, "emission"], empty) | {"g": torch.tensor(0.1)}
     parameters = [Parameter(n, ParameterSettings(), v, grid) for n, v in values.items()]
     stages = find_stages(3, scene, parameters)
-    trials = [0] if others else []
+    is_told = any(isinstance(light, DirectionalLight) for light in lights)
+    trials = [0] if others and not is_told else []
     assert [stage.level for stage in stages] == [0, 0, *trials, 1, 2]
     assert [at for at, stage in enumerate(stages) if stage.is_trial] == [2] * len(trials)
     assert stages[0].waiting == waiting and not any(stage.waiting for stage in stages[1:])
@@ -121,11 +123,9 @@ def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
     assert ending["kind"] == "rest" and ending["residual"] < 3 * ending["noise"]
 
 
-def test_a_trial_ends_at_once_where_pictures_tell_densities_apart() -> None:
+def test_what_is_cut_short_has_no_trial() -> None:
     stages = [Stage(0), Stage(0, is_trial=True), Stage(1)]
-    assert drive(Schedule(AUTO, stages), 0.9 * REST, 2 * UNLIKE) == [0, 0, 1, 1]
-    # What is cut short has no trial.
-    assert drive(Schedule(8, stages), 1.1 * REST, 0.5 * UNLIKE) == [0] * 4 + [1] * 4
+    assert drive(Schedule(8, stages), 1.1 * REST) == [0] * 4 + [1] * 4
 
 
 @pytest.mark.parametrize(("prior", "levels"), [(0.4, [0, 1, 2]), (0.6, [0, 1, 1, 2, 2])])

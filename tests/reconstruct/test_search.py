@@ -68,7 +68,7 @@ def advance(search: Search, function: Function, count: int) -> Tensor:
     """Where `search` is after `count` candidates, or when no step helps."""
     for _ in range(count):
         if not search.is_stuck:
-            candidate = search.candidate()
+            candidate = search.candidate
             search.judge(candidate, objective_of(function, candidate["x"]))
     return search.values["x"]
 
@@ -134,13 +134,13 @@ def test_a_candidate_that_is_no_better_shortens_the_step(loss: float) -> None:
     search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), -10.0))
     before, step, values = search.loss, search.step, search.values
     nothing = {"x": torch.full((COUNT,), torch.nan).double()}
-    assert not search.judge(search.candidate(), Objective(loss, 0.0, nothing, {}))
+    assert not search.judge(search.candidate, Objective(loss, 0.0, nothing, {}))
     assert 0.1 * step <= search.step <= 0.5 * step
     assert search.loss == before and search.values is values and not search.pairs
     # Where no step helps it says so, and does not move.
     for _ in range(100):
         if not search.is_stuck:
-            search.judge(search.candidate(), Objective(loss, 0.0, nothing, {}))
+            search.judge(search.candidate, Objective(loss, 0.0, nothing, {}))
     assert search.is_stuck and search.gain == 0.0 and search.values is values
 
 
@@ -153,7 +153,7 @@ def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has() -> None:
     start, space = random_values(COUNT, seed=3), space_of(MATRIX.diagonal(), -10.0)
     search = begin(quadratic, start, space, prior)
     for _ in range(4):
-        candidate = search.candidate()
+        candidate = search.candidate
         search.judge(candidate, objective_of(quadratic, candidate["x"], prior))
     search.reweigh(0.25)
     slope = search.objective.slopes(0.25)["x"]

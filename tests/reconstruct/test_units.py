@@ -10,8 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.coefficients import Volume, mix_media
 from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene, View

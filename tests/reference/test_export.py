@@ -14,7 +14,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.reference.export import export_scene
+from ddrecon.reference.exchange import export_scene
 from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.scene import View
 

@@ -18,11 +18,8 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
-from ddrecon.medium.phase import HenyeyGreenstein
-from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.medium.phase_series import Tabulated
-from ddrecon.numerics.angle_table import STEPS
-from ddrecon.numerics.legendre import even_angles
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, Tabulated, TwoLobe
+from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.reference.trace import pick_color
 from ddrecon.scene import Scene

@@ -12,8 +12,7 @@ from media import make_camera, make_scene, random_values
 from ddrecon.errors import DataWarning, FormatError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
-from ddrecon.reference.export import export_scene
-from ddrecon.reference.scene_import import import_scene
+from ddrecon.reference.exchange import export_scene, import_scene
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import cross_sections

@@ -24,10 +24,9 @@ from ddrecon.cameras import project
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.pictures import srgb
-from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.frame import Row
 from ddrecon.report import volumes
-from ddrecon.report.curve import Plot, draw_curve
-from ddrecon.report.page import page_text, write_page
+from ddrecon.report.page import Plot, draw_curve, page_text, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import (
     FARTHEST,

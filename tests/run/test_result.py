@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import write_field
 from ddrecon.picture import render
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import RunFolder
+from ddrecon.run.run_folder import Run
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import describe, dump_scene, read_scene
+from ddrecon.scene_file.load import read_scene
 
 CROSS_SECTIONS = {
     "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",
@@ -71,19 +71,16 @@ def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g
     np.save(folder / "front.npy", random.random((6, 7, 3), dtype=np.float32))
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
     scene_file = read_scene(path)
-    run = Reconstruction(build_scene(scene_file))
-    row = run.step()
-    for parameter in run.parameters:
-        limit = 0.9 if parameter.name in ("albedo", "phase.weight") else torch.inf
-        state = parameter.state()
-        parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
-    (folder / "out").mkdir()
-    dump_scene(describe(scene_file), folder / "out" / "scene.yaml")
-    run_folder = RunFolder(run, folder / "out", scene_file, {})
-    run_folder.begin()
-    run_folder.log.add(row)
-    run_folder.finish(lambda views, _: views)
-    return run.current_scene()
+    job = Run(build_scene(scene_file), scene_file, {})
+    with claim_folder(folder / "out", RUN) as claimed:
+        job.begin(claimed, is_resumed=False)
+        job.step()
+        for parameter in job.run.parameters:
+            limit = 0.9 if parameter.name in ("albedo", "phase.weight") else torch.inf
+            state = parameter.state()
+            parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
+        job.finish()
+    return job.run.current_scene()
 
 
 @pytest.mark.parametrize(

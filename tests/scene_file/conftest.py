@@ -4,8 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from ddrecon.errors import DdreconError, SceneError
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.load import SceneFile, read_scene
 
 
@@ -26,6 +29,12 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Pa
 def read(write: Callable[[str], Path]) -> Callable[..., SceneFile]:
     """Reads text as a scene, with overrides."""
     return lambda text, *overrides: read_scene(write(text), overrides)
+
+
+@pytest.fixture
+def load(write: Callable[[str], Path]) -> Callable[..., Scene]:
+    """Text as a scene of tensors, by default in double precision."""
+    return lambda text, dtype=torch.float64: load_scene(write(text), dtype=dtype)
 
 
 @pytest.fixture

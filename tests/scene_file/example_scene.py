@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ddrecon.scene_file.load import scene_text
@@ -23,9 +24,20 @@ lights:
 views:
   - {{name: front, camera: {CAMERA}}}
 """
+TREE = yaml.safe_load(SCENE)
+VOLUME, VIEW = TREE["volume"], TREE["views"][0]
+BOUNDS = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
+SHAPE = (4, 3, 2)
+"""Its cells [z, y, x]."""
 
 
 def changed(**sections: Any) -> str:
     """`SCENE` with whole sections replaced, or, where the value is None, left out."""
-    tree = yaml.safe_load(SCENE) | sections
+    tree = TREE | sections
     return scene_text({name: value for name, value in tree.items() if value is not None})
+
+
+def volume(left_out: tuple[str, ...] = (), views: Any = TREE["views"], **changes: Any) -> str:
+    """`SCENE` with another volume, or other views as well."""
+    section = {name: value for name, value in (VOLUME | changes).items() if name not in left_out}
+    return changed(volume=section, views=views)

@@ -1,16 +1,28 @@
 """Scene files as records: each rule of the schema, told with line, column and key."""
 
-import json
+import math
 from collections.abc import Callable
+from operator import mul, sub
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
-from example_scene import CAMERA, SCENE, changed
+from example_scene import CAMERA, SCENE, changed, volume
 
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene, referenced_files
+from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    dump_scene,
+    read_scene,
+    referenced_files,
+    ring_cameras,
+)
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
+from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
+from ddrecon.turntable import upright_axis
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]
@@ -99,11 +111,9 @@ RING = {"count": 1, "radius": 3, "fov": 30}
 OWN = ["shoot/own.npz", "shoot/r0.npy"]
 """Files of a scene in the folder `shoot`."""
 TYPED = {
-    "volume.g=0": OWN,
     "volume.density={file: a.npz}": ["a.npz", OWN[1]],
     "volume.density.file=b/../a.npz": ["b/../a.npz", OWN[1]],
     "lights=[{type: ambient, radiance: 1}, {type: environment, file: sky.npy}]": ["sky.npy", *OWN],
-    "optimize.parameters={density: {init: {file: a.npz}}}": ["a.npz", *OWN],
     f"views=[{{image: front.npy, camera: {CAMERA}}}]": ["front.npy", OWN[0]],
     f"views={{ring: {RING}, images: 'r*.npy'}}": ["r0.npy", OWN[0]],
     f"views.ring={RING}": OWN,
@@ -120,12 +130,10 @@ def test_paths_that_are_typed_start_at_the_current_folder(
     Path("shoot").mkdir()
     for picture in ("r0.npy", "shoot/r0.npy"):
         Path(picture).touch()
-    volume = yaml.safe_load(SCENE)["volume"] | {"density": {"file": "own.npz"}}
-    Path("shoot/scene.yaml").write_text(
-        changed(volume=volume, views={"ring": RING, "images": "r*.npy"})
-    )
-    found = referenced_files(read_scene("shoot/scene.yaml", [override]))
-    assert {*found} == {tmp_path / file for file in files}
+    views = {"ring": RING, "images": "r*.npy"}
+    Path("shoot/scene.yaml").write_text(volume(density={"file": "own.npz"}, views=views))
+    named = referenced_files(read_scene("shoot/scene.yaml", [override]))
+    assert {*named} == {tmp_path / file for file in files}
 
 
 @pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])
@@ -137,23 +145,11 @@ def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
     assert optimize.parameters.keys() == {"density", name}
 
 
-def test_json_is_a_scene_too(tmp_path: Path, read: Read):
-    tree = yaml.safe_load(SCENE)
-    tree["lights"][0]["irradiance"] = 3.141592653589793
-    tree["diffusion"] = {"tolerance": 1e-05}
-    path = tmp_path / "scene.json"
-    path.write_text(json.dumps(tree, indent=1))
-    loaded = read_scene(path).tree
-    assert loaded.diffusion.tolerance == 1e-05
-    assert loaded.lights[0] == DirectionalSection((-2, -2, -1), 3.141592653589793)
-    assert loaded.volume == read(SCENE).tree.volume
-
-
 def test_marks_lead_later_errors_to_the_line(read: Read):
     scene_file = read(SCENE, "volume.g=0.1")
     for key, place in {"lights.1.radiance": "10:31", "views.0.image.never.written": "12:5"}.items():
-        told = str(scene_file.refused(key, "odd"))
-        assert told.endswith(f"scene.yaml:{place}: {key}: odd")
+        line = str(scene_file.refused(key, "odd"))
+        assert line.endswith(f"scene.yaml:{place}: {key}: odd")
     assert str(scene_file.refused("volume.g", "odd")) == "-D volume.g=0.1: volume.g: odd"
 
 
@@ -170,3 +166,92 @@ def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_p
     dump_scene(describe(scene_file), tmp_path / "elsewhere" / "scene.yaml")
     assert read_scene(tmp_path / "elsewhere" / "scene.yaml").tree == scene_file.tree
     assert "support_margin" not in (tmp_path / "elsewhere" / "scene.yaml").read_text()
+
+
+# Rings of cameras: where they stand, and which images are theirs.
+
+CIRCLE = {"count": 3, "radius": 3.2, "height": 0.3, "fov": 28, "resolution": [8, 6]}
+
+
+@pytest.mark.parametrize("up", range(3))
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_ring_goes_around_its_target_about_the_way_up(up: int, is_own: bool) -> None:
+    """From the axis after it, x, y, z and x again, towards the one after that."""
+    upright, ahead, aside = up, (up + 1) % 3, (up + 2) % 3
+    along = (float(up == 0), float(up == 1), float(up == 2))
+    of_ring = {"up": along} if is_own else {}
+    ring = RingSection(count=10, radius=2, fov=30, target=(1, 2, 3), height=0.5, **of_ring)
+    cameras = ring_cameras(ring, (1.0, 2.0, 3.0) if is_own else along)
+    offsets = [tuple(map(sub, camera.origin or (), ring.target)) for camera in cameras]
+    assert offsets[0][ahead] == 2 and offsets[1][aside] > 0 > offsets[-1][aside]
+    for camera, offset in zip(cameras, offsets, strict=True):
+        assert offset[upright] == 0.5
+        assert math.hypot(offset[ahead], offset[aside]) == pytest.approx(2)
+        same = {"origin": camera.origin, "target": (1, 2, 3), "up": along, "fov": 30}
+        assert camera == PerspectiveSection(**same)
+    turns = [math.dist(offsets[i - 1], offsets[i]) for i in range(10)]
+    assert turns == pytest.approx([4 * math.sin(math.pi / 10)] * 10)
+
+
+def test_a_ring_lies_around_a_tilted_way_up() -> None:
+    """Whatever its length: cameras keep their height along it, and their distance."""
+    up = (0.3, -2.0, 0.5)
+    ring = RingSection(count=5, radius=2, fov=30, height=0.5, up=up)
+    for camera in ring_cameras(ring, (0, 1, 0)):
+        assert camera.origin is not None
+        assert sum(map(mul, camera.origin, up)) == pytest.approx(0.5 * math.hypot(*up))
+        assert math.hypot(*camera.origin) == pytest.approx(math.hypot(2, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("volume", "ring", "axis"),
+    [({}, {}, 1), ({"up": "z"}, {}, 2), ({"up": "x"}, {}, 0), ({"up": "z"}, {"up": [0, 1, 0]}, 1)],
+)
+def test_the_volume_says_what_is_up(read: Read, volume: Any, ring: Any, axis: int) -> None:
+    volume = yaml.safe_load(SCENE)["volume"] | volume
+    scene_file = read(changed(volume=volume, views={"ring": CIRCLE | ring}))
+    assert upright_axis(build_scene(scene_file)) == "xyz".index(volume.get("up", "y"))
+    views = scene_file.tree.views
+    assert [view.camera.origin[axis] for view in views] == [CIRCLE["height"]] * 3
+    assert [view.camera.up[axis] for view in views] == [1] * 3
+
+
+def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None:
+    scene_file = read(changed(views={"ring": CIRCLE, "test_every": 2}))
+    views = scene_file.tree.views
+    assert [view.name for view in views] == ["ring_00", "ring_01", "ring_02"]
+    assert [view.split for view in views] == ["test", "train", "test"]
+    assert all(view.image is None for view in views)
+    dump_scene(describe(scene_file), tmp_path / "dump.yaml")
+    assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        *(["a", "b", "c"], ["2", "10", "11"], ["09", "10", "100"], ["1_10", "2_1", "2_9"]),
+        *(["0.25", "0.50", "1.00"], ["a-2", "a-9", "a-10"]),
+    ],
+)
+@pytest.mark.parametrize("pattern", ["targets/t_*.exr", "targets\\t_*.exr"])
+def test_images_are_in_order_of_their_numbers(
+    read: Read, tmp_path: Path, names: list[str], pattern: str
+) -> None:
+    """Of files alone, which are relative to the scene."""
+    (tmp_path / "targets").mkdir()
+    paths = [tmp_path / "targets" / f"t_{name}.exr" for name in names]
+    for path in reversed(paths):
+        path.touch()
+    (tmp_path / "targets" / "t_d.exr").mkdir()
+    views = read(changed(views={"ring": CIRCLE, "images": pattern})).tree.views
+    assert [view.image for view in views] == paths
+
+
+@pytest.mark.parametrize("names", [["0.25", "0.5", "1"], ["-30", "0", "30"], ["1.9", "1.10", "2"]])
+def test_an_order_that_is_not_plain_is_refused(
+    refusal: Callable[..., list[str]], tmp_path: Path, names: list[str]
+) -> None:
+    for name in names:
+        (tmp_path / f"t_{name}.exr").touch()
+    (line,) = refusal(changed(views={"ring": CIRCLE, "images": "t_*.exr"}))
+    assert "views.images: 't_*.exr' matches names with fractions or signs" in line

@@ -117,7 +117,6 @@ CASES = {
     "cubes": Case(spacing=CUBES, directions=50),
     "thin": Case(spacing=THIN),
     "gray": Case(colors=1, moments=1, is_lit=False),
-    "gray-begun": Case(colors=1, known=4, spacing=CUBES),
     "fields": Case(varies=True, moments=1),
     "44": Case(directions=44, moments=36, spacing=CUBES),
     "wide": Case((3, 4, 35), CUBES),
@@ -129,15 +128,11 @@ CASES = {
     "cell": Case((1, 1, 1), CUBES),
     "opaque": Case(depth=1e4, spacing=CUBES),
     "empty": Case(depth=0.0),
-    "shallow": Case((6, 5, 37), CUBES, colors=1, depth=0.1),
-    "island": Case((7, 8, 70), CUBES, colors=1, is_island=True),
     "island-slanted": Case((7, 8, 70), FLAT, colors=1, is_island=True),
     "island-high": Case((25, 40, 7), colors=1, moments=1, is_island=True),
     "around-zx": Case((3, 4, 5), periodic=(0, 2), directions=50, moments=36),
-    "around-y": Case(periodic=(1,), spacing=CUBES),
     "around-cubes": Case(periodic=(0, 1), spacing=CUBES, directions=50, colors=1, varies=True),
     "refracting": Case(index=1.4, known=4),
-    "refracting-line": Case((1, 9, 1), CUBES, index=1.3, moments=1),
 }
 
 

@@ -1,25 +1,213 @@
-"""Sweeps and rounds are what loops over directions and cells make of E2.9 and E2.10."""
+"""Sweeps and rounds: slow twins by loops over directions, slices and cells; closed forms."""
 
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
 import pytest
 import torch
-from media import box_grid, half_empty, random_values
-from plain_rays import (
-    factors_by_formula,
-    mean_density,
-    round_by_loops,
-    share_by_loops,
-    sweep_by_loops,
-)
+from media import box_grid, dense_matrix, half_empty, random_values
 from torch import Tensor
 
-from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.solve import solve_by_multigrid
+from ddrecon.grid import Grid
 from ddrecon.light.moments import cut, fill
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.transport.characteristics import Characteristic, Direction, Ends
+from ddrecon.transport.characteristics import radiance_along as follow
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds
-from ddrecon.transport.sweep import emitted_light, steep_gradient, sweep
+from ddrecon.transport.sweep import (
+    cell_gradient,
+    emitted_light,
+    steep_gradient,
+    sweep,
+    sweep_rule,
+)
+
+Cell = tuple[int, int, int]
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
+NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
+"""Gauss's rule on [0, 1]."""
+
+
+def arriving(leaving: Tensor, cell: Cell, moved: list[float], edge: float) -> float:
+    """The mean of what cells around `cell` - `moved` let through; beyond the box, `edge`."""
+    total = 0.0
+    for corner in product((0, 1), repeat=3):
+        part, at = 1.0, []
+        for i, m, c in zip(cell, moved, corner, strict=True):
+            part *= abs(m) if c else 1 - abs(m)
+            at.append(i - c * int(math.copysign(1, m)))
+        if part > 1e-12:
+            is_inside = all(0 <= i < n for i, n in zip(at, leaving.shape, strict=True))
+            total += part * (float(leaving[tuple(at)]) if is_inside else edge)
+    return total
+
+
+def rise_at(q: Tensor, cell: Cell, moved: list[float]) -> float:
+    """How much `q` [z, y, x] rises over `moved` cells, by differences of the nearest neighbors."""
+    total = 0.0
+    for axis, m in enumerate(moved):
+        ends = [list(cell), list(cell)]
+        ends[0][axis] = max(cell[axis] - 1, 0)
+        ends[1][axis] = min(cell[axis] + 1, q.shape[axis] - 1)
+        if apart := ends[1][axis] - ends[0][axis]:
+            total += m * float(q[tuple(ends[1])] - q[tuple(ends[0])]) / apart
+    return total
+
+
+def by_cells(
+    medium: Medium,
+    scatters: Tensor,
+    even: Tensor,
+    direction: Direction,
+    inflow: float = 0.0,
+    steep: Sequence[Tensor] = (),
+) -> Tensor:
+    """Means of I [z, y, x] of a gray medium, cell after cell (E2.9); `even` has the slope of q.
+
+    It is `steep` times as much by axis, if given. With what is emitted at the part s of a way, and
+    I there, integrated by Gauss's rule.
+    """
+    extinction, scattering = medium.extinction.value[0], medium.remaining_scattering[0]
+    axis, step = fastest_axis(medium.grid, direction)
+    moved = [step * c / h for c, h in zip(direction, medium.grid.spacing, strict=True)]
+    leaving, means = torch.zeros_like(extinction), torch.zeros_like(extinction)
+    for cell in sorted(
+        product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * moved[axis]
+    ):
+        depth, strength = step * float(extinction[cell]), step * float(scattering[cell])
+        ways = [m * float(s[cell]) for m, s in zip(moved, steep, strict=True)] if steep else moved
+        emitted = strength * (float(scatters[cell]) + rise_at(even, cell, ways) * (NODES - 0.5))
+        before, left = arriving(leaving, cell, moved, inflow), 1 - NODES
+        # what is emitted at s is exp(-depth (t - s)) of it at t: at the end, and on average
+        leaving[cell] = before * math.exp(-depth) + WEIGHTS @ (emitted * np.exp(-depth * left))
+        rest = [t * (WEIGHTS @ np.exp(-depth * t * NODES)) for t in left]
+        means[cell] = before * (WEIGHTS @ np.exp(-depth * NODES)) + WEIGHTS @ (emitted * rest)
+    return means
+
+
+def fastest_axis(grid: Grid, direction: Direction) -> tuple[int, float]:
+    """The axis along which most cells are crossed, and the length of the way through one."""
+    steps = [h / max(abs(c), 1e-300) for c, h in zip(direction, grid.spacing, strict=True)]
+    return steps.index(min(steps)), min(steps)
+
+
+def quadrature(directions: int) -> list[tuple[Direction, float]]:
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
+    return list(zip(map(tuple, points.tolist()), weights.tolist(), strict=True))
+
+
+def steepness(medium: Medium, directions: int) -> list[Tensor]:
+    """1 + 2 x d sqrt(36 + d^2) / (d^2 + 0.01) of E2.16, by axis [z, y, x]."""
+    over, first, second = np.zeros(3), np.zeros(3), np.zeros(3)
+    for w, weight in quadrature(directions):
+        step, h = fastest_axis(medium.grid, w)[1], np.array(medium.grid.spacing)
+        t = step * np.abs(w) / h
+        over += weight * t * (1 - t) * h**2 / step
+        first += weight * step * np.square(w)
+        second += weight * step**2 * np.square(w)
+    depths = (medium.extinction.value[0] * s for s in second / first)
+    each = zip(over / first, depths, strict=True)
+    return [1 + x * d * (36 + d**2).sqrt() / (d**2 + 0.01) for x, d in each]
+
+
+def sweep_by_loops(
+    medium: Medium, source: Tensor, even: Tensor, inflow: float, directions: int
+) -> Tensor:
+    """The means of I Y_k [K, 1, z, y, x] (E2.8), gray, one direction after another."""
+    total, steep = torch.zeros_like(source), steepness(medium, directions)
+    degree = math.isqrt(len(source)) - 1
+    for w, weight in quadrature(directions):
+        values = harmonics(torch.tensor(w, dtype=torch.float64), degree).view(-1, 1, 1, 1, 1)
+        scatters = (values * source).sum(0)[0]
+        total += weight * values * by_cells(medium, scatters, even, w, inflow, steep)
+    return total
+
+
+def share_by_loops(medium: Medium, directions: int) -> Tensor:
+    """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step.
+
+    And kappa_t 3/2 of the mean of t (1 - t) h^2 / step, along the axis where that is most.
+    """
+    length = weights = 0.0
+    shared = [0.0, 0.0, 0.0]
+    for w, weight in quadrature(directions):
+        axis, step = fastest_axis(medium.grid, w)
+        if medium.grid.shape[axis] > 1:
+            length, weights = length + weight * step, weights + weight
+        for one, h in enumerate(medium.grid.spacing):
+            t = step * abs(w[one]) / h
+            shared[one] += (medium.grid.shape[one] > 1) * 1.5 * weight * t * (1 - t) * h**2 / step
+    share = torch.ones_like(medium.extinction.value)
+    # (1 - f) kappa_s times g' = (g - f) / (1 - f)
+    directed = (medium.g - medium.forward_fraction) * medium.scattering.value
+    transport = medium.extinction.value - directed
+    for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
+        half = 0.5 * extinction * length / max(weights, 1e-9)
+        if half > 0:
+            rho = half / math.tanh(half) - 1 + max(shared) * extinction
+            share.view(-1)[cell] = 1 / (
+                1 + 0.7 * rho * float(transport.flatten()[cell]) / extinction
+            )
+    return share
+
+
+def remaining_by_formula(g: float, degree: int) -> list[float]:
+    """p_l of E8.4, and what scaling leaves of a g below 0."""
+    f = max(g, 0.0) ** (degree + 1)
+    return [(g**ell - f) / (1 - f) for ell in range(degree + 1)]
+
+
+def factors_by_formula(g: float, rounds: int) -> list[float]:
+    """1 / (1 - nu) at Chebyshev's nodes nu (E7.1)."""
+    bound = 0.9 * remaining_by_formula(g, 3)[2]
+    return [1 / (1 - bound * math.cos((k + 0.5) * math.pi / rounds)) for k in range(rounds)]
+
+
+def round_by_loops(
+    problem: DiffusionProblem,
+    source: Tensor,
+    swept: Medium,
+    light: Tensor,
+    g: float,
+    degree: int,
+    directions: int,
+    is_last: bool,
+) -> Tensor:
+    """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves.
+
+    `swept` is the problem's medium with the means of cells.
+    """
+    operator, right = problem.system
+    angles = degree if problem.has_flux else 0
+    matrix, theta = dense_matrix(operator)[0], share_by_loops(swept, directions)
+    p = remaining_by_formula(g, angles)
+    each = light.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
+    source = each.view(-1, 1, 1, 1, 1) * fill(light, angles) + source
+    new = sweep_by_loops(swept, source, source[0, 0], float(problem.outside), directions)
+    gain = theta * (new[0] - light[0])
+    imbalance = right - (matrix @ light[0].flatten()).view_as(right)
+    total = right + swept.remaining_scattering * gain - imbalance
+    if not problem.has_flux:
+        return (torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)[None]
+    part = 1.0 if is_last else (1 - p[1]) / (2 - p[1])
+    change = theta * (new[1:4] - light[1:4])
+    # the same problem with this flux as its only source: what E2.4 adds to the right side
+    turned = torch.cat([torch.zeros_like(gain)[None], part * p[1] * change])
+    alone = replace(problem, source=turned, outside=0 * problem.outside)
+    total = total + alone.system[1]
+    u = torch.linalg.solve(matrix, total.flatten()).view_as(right)
+    flux, more, was = problem.flux(u), alone.flux(0 * u), problem.flux(light[0])
+    first = flux + more + change + light[1:4] - was
+    return torch.cat([(u + gain)[None], first, new[4:]])
+
 
 has_flux_or_not = pytest.mark.parametrize("has_flux", [False, True])
 
@@ -68,20 +256,6 @@ def test_the_share_of_a_change_is_that_of_the_mean_step(shape: tuple[int, int, i
     torch.testing.assert_close(share, share_by_loops(medium, 44), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4)], ids=str)
-def test_sweeps_see_the_means_of_cells(shape: tuple[int, int, int]):
-    """Of each field, whether both coefficients have the same one or not."""
-    for varies in (False, True):
-        medium = gray_medium(shape, 0.4, varies)
-        found = average_cells(medium)
-        for one, mean in (
-            (medium.extinction, found.extinction),
-            (medium.remaining, found.remaining),
-        ):
-            expected = mean.scale.view(-1, 1, 1, 1) * mean_density(one.field[0])
-            torch.testing.assert_close(mean.value, expected, rtol=1e-13, atol=1e-15)
-
-
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
 def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
     shape, degree = (2, 2, 3), 3 * (g != 0)
@@ -108,3 +282,100 @@ def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
             expected = old + factor * (new - old)
         light = run_rounds(problem, source[4:], start, solve, rounds, 3)
         torch.testing.assert_close(light, expected, rtol=1e-9, atol=1e-11)
+
+
+DIRECTIONS = (
+    (0.0, 0.0, 1.0),
+    (0.0, -1.0, 0.0),
+    (0.6, 0.0, -0.8),
+    (-(3**-0.5),) * 3,
+    (0.48, -0.36, 0.8),
+    (-0.1, 0.7, -(0.5**0.5)),
+)
+each_direction = pytest.mark.parametrize("direction", DIRECTIONS)
+
+
+def medium_of(
+    density: Tensor, grid: Grid, albedo: float = 0.9, g: float = 0.0, colors: int = 1
+) -> Medium:
+    extinction = 4 + 3 * torch.arange(colors, dtype=density.dtype)
+    return scale_medium(
+        Volume(grid, density, (1 - albedo) * extinction, albedo * extinction, density.new_tensor(g))
+    )
+
+
+def random_source(grid: Grid, colors: int = 1) -> Tensor:
+    return 1 + random_values(colors, *grid.shape, seed=1)
+
+
+def outside(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64).view(-1, 1, 1, 1)
+
+
+def radiance_along(
+    medium: Medium, scatters: Tensor, rise: Tensor, inflow: Tensor | None, direction: Direction
+) -> tuple[Tensor, Ends]:
+    """I of what `scatters`, with light from outside, and what leaves the box besides that."""
+    emitted = emitted_light(medium, cut(scatters[None]), inflow)[0]
+    gradient = medium.remaining.value * rise
+    mean, gone = follow(medium.grid, medium.extinction.value, emitted, gradient, direction)
+    return mean if inflow is None else mean + inflow, gone
+
+
+@each_direction
+def test_slices_at_once_are_cells_one_by_one(direction):
+    grid = box_grid((3, 4, 5))
+    medium, scatters = medium_of(4 * random_values(3, 4, 5), grid), random_source(grid)
+    even = random_values(*grid.shape, seed=2)
+    found, *_ = radiance_along(medium, scatters, cell_gradient(even[None]), outside(0.3), direction)
+    expected = by_cells(medium, scatters[0], even, direction, 0.3)
+    torch.testing.assert_close(found[0], expected, rtol=1e-12, atol=0)
+
+
+@each_direction
+@pytest.mark.parametrize("thickness", [1e-6, 1.0, 1e4])
+def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: float):
+    """Beside light that enters and would leave without a medium."""
+    grid = box_grid((4, 5, 3))
+    medium = medium_of(thickness * half_empty(4, 5, 3), grid)
+    scatters, room = random_source(grid), outside(0.7)
+    mean, gone = radiance_along(medium, scatters, cell_gradient(scatters), room, direction)
+    course = Characteristic.of(grid, direction)
+    emitted = (medium.remaining.value * scatters).sum() * course.step
+    absorbed = (medium.extinction.value * mean).sum() * course.step
+    # All of what leaves the last slice, and of the outermost rows and columns what drifts out.
+    shares = 1.0, *map(abs, course.drift)
+    left = sum(share * beyond.sum() for share, beyond in zip(shares, gone, strict=True))
+    torch.testing.assert_close(emitted, absorbed + left, rtol=1e-12, atol=1e-13)
+
+
+@each_direction
+@pytest.mark.parametrize("colors", [1, 3])
+def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int):
+    grid = box_grid((3, 2, 4))
+    density = (5 * half_empty(3, 2, 4)).requires_grad_()
+    inputs = [random_source(grid, colors), random_values(colors, 1, 1, 1)]
+    inputs = [tensor.clone().requires_grad_() for tensor in inputs]
+    g = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+
+    def radiance(density: Tensor, g: Tensor, scatters: Tensor, inflow: Tensor) -> Tensor:
+        extinction = density.new_tensor([3.0, 9.0, 20.0][:colors])
+        medium = scale_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
+        mean, gone = radiance_along(medium, scatters, cell_gradient(scatters), inflow, direction)
+        return mean, *gone
+
+    assert torch.autograd.gradcheck(
+        radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize(("directions", "count"), [(50, 36), (98, 64)])
+def test_moments_through_layers_tell_all_harmonics_apart_and_keep_energy(
+    directions: int, count: int
+):
+    """E2.18; the mean of light is the quadrature's, whatever light is."""
+    grid = Grid((2, 2, 2), (0.0,) * 3, (1.0,) * 3, periodic=(1, 2))
+    _, weights, values, weighted = sweep_rule(grid, directions, count)
+    unit = torch.eye(count, dtype=torch.float64)
+    torch.testing.assert_close(weighted.T @ values, unit, rtol=0, atol=1e-12)
+    torch.testing.assert_close(weighted[:, 0], values.new_tensor(weights), rtol=0, atol=1e-14)

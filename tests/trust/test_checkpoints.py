@@ -12,7 +12,8 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.run.checkpoint import (
+from ddrecon.run import job
+from ddrecon.run.job import (
     LAST,
     MOST_CHANGES,
     PREVIOUS,
@@ -20,7 +21,6 @@ from ddrecon.run.checkpoint import (
     require_same,
     save_checkpoint,
 )
-from ddrecon.run.job import Checkpoints, Job
 
 pytestmark = pytest.mark.slow
 
@@ -134,13 +134,13 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
 def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As often as they are to be, unless they take more than their share of the time."""
     saved: list[int] = []
-    original = Checkpoints.save
+    original = job.save_checkpoint
 
-    def save(self: Checkpoints, job: Job) -> None:
-        saved.append(job.iteration)
-        original(self, job)
+    def save(folder: Path, state: dict[str, Any], *scene: Any) -> None:
+        saved.append(state["frames"][0]["total"]["iteration"])
+        original(folder, state, *scene)
 
-    monkeypatch.setattr(Checkpoints, "save", save)
+    monkeypatch.setattr(job, "save_checkpoint", save)
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e9)
     run(*OPTIMIZE, "--iterations", "4")

@@ -56,11 +56,6 @@ def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes: dict[str, 
     assert {pattern_of(name) for name in names} == set(KINDS)
 
 
-def test_phase_g_is_g_where_there_is_but_one(scenes: dict[str, Scene]) -> None:
-    changed = with_values(scenes[""], {"phase.g": torch.tensor(0.1, dtype=torch.float64)})
-    assert value_of(changed, "g") == value_of(changed, "phase.g") == 0.1
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("pattern", KINDS)

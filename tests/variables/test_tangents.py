@@ -10,8 +10,7 @@ from ddrecon.errors import UsageError
 from ddrecon.lighting import solve_light
 from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
-from ddrecon.variables.tangents import variation
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import value_of, variation, with_values
 
 STEP = 1e-5
 
@@ -32,12 +31,12 @@ def test_a_derivative_image_is_the_central_difference_of_the_image(scene: Scene)
     name = "albedo.b"
     variable, change = variation(scene, name)
     assert variable == "albedo" and change.tolist() == [0.0, 0.0, 1.0]
-    found, value = render_tangent(scene, name, images_of), value_of(scene, variable)
+    images, value = render_tangent(scene, name, images_of), value_of(scene, variable)
     high, low = (
         images_of(with_values(scene, {variable: value + step * change})) for step in (STEP, -STEP)
     )
     as_it_is = images_of(scene)
-    for key, (image, derivative) in found.items():
+    for key, (image, derivative) in images.items():
         difference = (high[key] - low[key]) / (2 * STEP)
         size = max(1e-2, float(difference.abs().max()))
         assert (derivative - difference).abs().max() <= 1e-6 * size, key

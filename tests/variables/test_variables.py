@@ -99,7 +99,7 @@ def test_a_star_is_every_training_view_with_an_image() -> None:
 
 
 def test_the_settings_of_a_view_itself_win() -> None:
-    views, given = [view("a"), view("b")], [("views.*.camera", 1), ("views.b.camera", 2)]
-    for parameters in (given, given[::-1]):
+    views, pairs = [view("a"), view("b")], [("views.*.camera", 1), ("views.b.camera", 2)]
+    for parameters in (pairs, pairs[::-1]):
         named = name_each(dict(parameters), views)
         assert named == {"views.a.camera": 1, "views.b.camera": 2}

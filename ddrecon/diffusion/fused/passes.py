@@ -23,7 +23,7 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import TensorSteps
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
-from ddrecon.numerics.reads import may_read
+from ddrecon.numerics.remember import may_read
 
 Kind = IntEnum(
     "Kind",

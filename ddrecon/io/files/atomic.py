@@ -71,10 +71,15 @@ def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
         flush(path.parent)
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path`."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
 def write_json(path: Path, content: Any) -> None:
     """Writes `content` to `path` as JSON, indented."""
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_bytes(path, f"{json.dumps(content, indent=1)}\n".encode())
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -24,14 +24,13 @@ from ddrecon.io.files.atomic import (
     note_written,
     refusals,
     remove_temporaries,
-    replace_file,
+    write_bytes,
 )
 
 LOCK, MANIFEST = "ddrecon.lock", "ddrecon.manifest"
 """The names of the lock file, and of the file that names the others."""
-RUN, FILM, UNCERTAINTY, RENDER, REFERENCE, BENCH = KINDS = (
-    *("run", "film", "uncertainty", "render", "reference", "bench"),
-)
+KINDS = "run", "film", "uncertainty", "render", "reference", "bench"
+RUN, FILM, UNCERTAINTY, RENDER, REFERENCE, BENCH = KINDS
 """The kinds of jobs that write folders."""
 TEXT: dict[str, Any] = {"encoding": "utf-8", "errors": "surrogateescape"}
 PATIENCE = 1.0
@@ -114,14 +113,13 @@ class Folder:
 
     def content(self) -> list[str]:
         """The names of all that is in the folder, but for what this class itself writes there."""
-        entries = [entry.name for entry in sorted(self.path.iterdir()) if not is_temporary(entry)]
-        return [name for name in entries if name not in (LOCK, MANIFEST)]
+        entries = (entry for entry in sorted(self.path.iterdir()) if not is_temporary(entry))
+        return [entry.name for entry in entries if entry.name not in (LOCK, MANIFEST)]
 
     def write(self) -> None:
         """Writes the manifest."""
-        with replace_file(self.path / MANIFEST) as temporary:
-            lines = f"ddrecon {self.kind}", *self.names
-            temporary.write_text("".join(f"{line}\n" for line in lines), **TEXT)
+        text = "".join(f"{line}\n" for line in (f"ddrecon {self.kind}", *self.names))
+        write_bytes(self.path / MANIFEST, text.encode(**TEXT))
 
 
 @contextmanager
@@ -208,23 +206,22 @@ def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None
 
 def kind_of_folder(path: Path) -> str | None:
     """The kind of job that wrote the folder `path`; None without a manifest that says it."""
-    kind = _lines(path)[0].removeprefix("ddrecon ")
-    return kind if kind in KINDS else None
+    return _read_manifest(path)[0]
 
 
 def names_in(path: Path) -> list[str]:
     """The names in the manifest of the folder `path`; none that leads out of it."""
-    if kind_of_folder(path) is None:
-        return []
-    return [n for n in _lines(path)[1:-1] if not (n.startswith("/") or ".." in Path(n).parts)]
+    return [n for n in _read_manifest(path)[1] if not (n.startswith("/") or ".." in Path(n).parts)]
 
 
-def _lines(path: Path) -> list[str]:
-    """The lines of the manifest of the folder `path`, and what follows the last, torn perhaps."""
+def _read_manifest(path: Path) -> tuple[str | None, list[str]]:
+    """The kind and the names in the manifest of the folder `path`; a last line may be torn."""
     try:
-        return (path / MANIFEST).read_text(**TEXT).split("\n")
+        kind, *names = (path / MANIFEST).read_bytes().decode(**TEXT).split("\n")
     except OSError:
-        return [""]
+        return None, []
+    kind = kind.removeprefix("ddrecon ")
+    return (kind, names[:-1]) if kind in KINDS else (None, [])
 
 
 def require_free_files(paths: Sequence[Path], *, may_exist: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -117,9 +117,9 @@ def doubt_primaries(path: Path, source: str) -> None:
     _doubt(path, f"{source} with primaries other than sRGB's; colors are taken as they stand")
 
 
-def doubt_orientation(path: Path, orientation: int) -> None:
-    """Warns where viewers turn a picture of this EXIF `orientation`."""
-    if orientation in range(2, 9):
+def doubt_orientation(path: Path, exif: Mapping[int, Any]) -> None:
+    """Warns where viewers turn a picture with this `exif`."""
+    if (orientation := exif.get(ORIENTATION)) in range(2, 9):
         text = f"EXIF orientation {orientation} is not applied; cameras must be those of pictures"
         _doubt(path, f"{text} as they are stored, not as viewers turn them")
 

@@ -94,7 +94,7 @@ def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | N
     # here, as scene files know suffixes without NumPy
     import numpy as np
 
-    from ddrecon.io.files.arrays import check_size
+    from ddrecon.io.files.reading import check_size
 
     read = load_for_file("imageio_ffmpeg", path).read_frames
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it tells of turned films

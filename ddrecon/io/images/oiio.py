@@ -16,8 +16,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
-from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.reading import as_float32, check_size
 from ddrecon.io.images.color import (
     TOP_LEFT,
     doubt_chromaticities,

@@ -17,15 +17,9 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.arrays import as_float32, check_size, read_npy
-from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.images.color import (
-    ORIENTATION,
-    TOP_LEFT,
-    doubt_orientation,
-    has_linear_samples,
-)
+from ddrecon.io.files.atomic import replace_file, write_bytes
+from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
+from ddrecon.io.images.color import doubt_orientation, has_linear_samples
 from ddrecon.io.images.films import FILMS, read_frame
 from ddrecon.io.images.oiio import (
     PACKAGE,
@@ -114,8 +108,7 @@ def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
 
 def _read_stored(path: Path, frame: int, time: float) -> np.ndarray:
     """Linear values as floats, or whole numbers as the file has them."""
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
+    if (reader := READERS.get(path.suffix.lower())) is None:
         suffixes = ", ".join(READERS)
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {suffixes}")
     return read_frame(path, frame, time) if reader is read_frame else reader(path)
@@ -135,12 +128,11 @@ def _image_of(path: Path, values: np.ndarray, step: float = 0.0) -> Image:
         advice = "repair it: a pixel to ignore may hold any finite number"
         raise FormatError(path, f"{flaw} at {where}; {advice}")
     if values.ndim == 2:
-        return Image(np.repeat(values[..., None], 3, axis=2), None, step)
+        values = np.repeat(values[..., None], 3, axis=2)
     if values.shape[2] == 3:
         return Image(values, None, step)
-    coverage = values[..., 3]
-    pixels = np.where(coverage[..., None] > 0, values[..., :3], np.float32(0))
-    return Image(pixels, coverage, step)
+    pixels = np.where(values[..., 3:] > 0, values[..., :3], np.float32(0))
+    return Image(pixels, values[..., 3], step)
 
 
 def write_linear(
@@ -182,9 +174,7 @@ def webp_of(image: np.ndarray) -> bytes:
 
 def write_animation(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
     """Writes `frames`, uint8 [h, w, 3], to `path` as an endless PNG movie of `fps` a second."""
-    with replace_file(path) as temporary:
-        timing = {"duration": 1000 / fps, "loop": 0}
-        temporary.write_bytes(encode(np.stack(frames), ".png", **timing))
+    write_bytes(path, encode(np.stack(frames), ".png", duration=1000 / fps, loop=0))
 
 
 def png_of(pixels: np.ndarray) -> bytes:
@@ -194,8 +184,7 @@ def png_of(pixels: np.ndarray) -> bytes:
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
     """Writes `png_of` these `pixels` to `path`."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(png_of(pixels))
+    write_bytes(path, png_of(pixels))
 
 
 def write_picture(
@@ -238,7 +227,7 @@ def _read_encoded(path: Path) -> np.ndarray:
         else:
             stored = _samples_of(picture)
         # Other ways to ask for EXIF would decode a PNG for it.
-        doubt_orientation(path, Pillow.Image.getexif(picture).get(ORIENTATION, TOP_LEFT))
+        doubt_orientation(path, Pillow.Image.getexif(picture))
     return stored
 
 

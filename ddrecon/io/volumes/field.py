@@ -1,10 +1,12 @@
-"""A field on a grid as files hold it, and the rules that every volume format shares.
+"""A field on a grid as files hold it, the rules that every volume format shares, and units.
 
 Values are `[z, y, x]` or `[z, y, x, 3]`, cell-centered; bounds are in world order (x, y, z).
 """
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.arrays import as_float32
+from ddrecon.io.files.reading import as_float32
 
 BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""
@@ -54,16 +56,6 @@ def prune(values: np.ndarray) -> np.ndarray:
     return np.where(is_empty.reshape(*values.shape[:3], *[1] * (values.ndim - 3)), 0, values)
 
 
-def require_only_field(path: Path, fields: Fields) -> np.ndarray:
-    """The values of the one of `fields`, for a format that holds no more."""
-    if len(fields) != 1:
-        names = ", ".join(fields)
-        advice = "write each into a file of its own"
-        raise FormatError(path, f"a {path.suffix} holds one field, not {names}; {advice}")
-    (values,) = fields.values()
-    return values
-
-
 def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:
     """The field of `values` and `bounds` in the file at `path`; raises FormatError unless legal.
 
@@ -88,3 +80,25 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
     ):
         raise FormatError(path, f"bounds must be {BOX} with each minimum below its maximum")
     return Field(values, None if bounds is None else bounds.astype(np.float64))
+
+
+PREFIXES = {"": 1.0, "k": 1e3, "kilo": 1e3, "c": 1e-2, "m": 1e-3, "u": 1e-6, "micro": 1e-6}
+
+
+def _with_prefixes(*units: str) -> dict[str, float]:
+    return {prefix + unit: size for prefix, size in PREFIXES.items() for unit in units}
+
+
+METERS = _with_prefixes("m", "meter", "meters", "metre", "metres")
+"""Meters in a unit of length, by its spelling."""
+MICROMETERS = {unit: 1e6 * size for unit, size in METERS.items()} | {"micron": 1, "microns": 1}
+GRAMS = _with_prefixes("gm-3", "g/m3")
+"""Grams in a cubic meter, by the unit's spelling."""
+KELVIN = dict.fromkeys(("k", "kelvin", "kelvins", "degk"), 1.0)
+
+
+def size_of(unit: str, spellings: Mapping[str, float]) -> float | None:
+    """The size of a `unit` that a file spells in its own way, where `spellings` have it."""
+    plain = unicodedata.normalize("NFKC", unit).replace("μ", "u")
+    plain = re.sub(r"\s*above.*|[\s^{}*._]", "", plain)  # m above sea level; g m^{-3}; g.m**-3
+    return None if plain == "Mm" else spellings.get(plain.lower())  # megameters are no mm

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
-from ddrecon.io.files.arrays import check_size
-from ddrecon.io.volumes.field import Field, check_field
-from ddrecon.io.volumes.units import METERS, size_of
+from ddrecon.io.files.reading import check_size
+from ddrecon.io.volumes.field import METERS, Field, check_field, size_of
 
 LEVELS = "[pim]?lev|(model|pressure)_?lev|(air_)?pres|p$|isobaric|sigma|eta$|hybrid|atmosphere_"
 """How the names of axes begin that are no length but pressures, or numbers of levels."""
@@ -39,15 +38,11 @@ Coordinates = Mapping[str, Any]
 """Variables that say where cells lie, by dimension."""
 
 
-@dataclass(frozen=True)
-class _Side:
-    """Cells along a `dimension`.
-
-    `step` is -1 where they go down, else 1; `ends` [2] are where they begin and end, in units of
-    `meters`, where the file says so.
+class _Side(NamedTuple):
+    """Cells along a dimension: `step` is -1 where they go down, else 1; `ends` [2] are where they
+    begin and end, in units of `meters`, where the file says so.
     """
 
-    dimension: str
     step: int = 1
     ends: np.ndarray | None = None
     meters: float | None = None
@@ -113,11 +108,13 @@ def read_netcdf(path: Path, name: str) -> Field:
         first = [axes[axis] for axis in "zyx"]
         order = sorted(variable.dimensions, key=lambda side: [*first, side].index(side))
         values = values.transpose([variable.dimensions.index(side) for side in order])
-        sides = [_side(path, axis, axes[axis], coordinates.get(axes[axis])) for axis in "xyz"]
+        sides = {
+            axes[axis]: _side(path, axis, axes[axis], coordinates.get(axes[axis])) for axis in "xyz"
+        }
         bounds, unit = _box(path, sides), _says(variable, "units")
-    flips = tuple(slice(None, None, side.step) for side in reversed(sides))
+    flips = tuple(slice(None, None, sides[axes[axis]].step) for axis in "zyx")
     values = values.reshape(values.shape[:3])[flips]
-    meters = None if bounds is None else sides[0].meters
+    meters = None if bounds is None else sides[axes["x"]].meters
     return replace(check_field(path, name, values, bounds), unit=unit, meters=meters)
 
 
@@ -165,7 +162,7 @@ def _side(path: Path, axis: str, dimension: str, coordinate: Any) -> _Side:
         advice = "interpolate to heights in m" if axis == "z" else f"project it to m, or {drop}"
         raise FormatError(path, f"{dimension} {fault}; {advice}")
     if coordinate is None:
-        return _Side(dimension)
+        return _Side()
     centers = _centers(path, coordinate, dimension)
     if is_depth and centers.min() < 0:
         advice = f"say which way it counts (ncatted -a positive,{dimension},o,c,up)"
@@ -181,7 +178,7 @@ def _side(path: Path, axis: str, dimension: str, coordinate: Any) -> _Side:
         ends = np.array([centers[0] - half, centers[-1] + half])
     if ends is not None:
         ends = np.sort([sign * ends.min(), sign * ends.max()]) + 0.0
-    return _Side(dimension, step, ends, meters)
+    return _Side(step, ends, meters)
 
 
 def _centers(path: Path, coordinate: Any, dimension: str) -> np.ndarray:
@@ -202,15 +199,13 @@ def _centers(path: Path, coordinate: Any, dimension: str) -> np.ndarray:
     return centers
 
 
-def _box(path: Path, sides: list[_Side]) -> np.ndarray | None:
+def _box(path: Path, sides: Mapping[str, _Side]) -> np.ndarray | None:
     """The corners of the box [2, 3], in the unit of x, where the file says all `sides`."""
-    ends = [side.ends for side in sides if side.ends is not None]
-    if len(ends) < len(sides):
+    _, ends, meters = zip(*sides.values(), strict=True)
+    if any(end is None for end in ends):
         return None
-    meters = [side.meters for side in sides if side.meters is not None]
-    if meters and len(meters) < len(sides):
-        silent = next(side.dimension for side in sides if side.meters is None)
-        advice = f"say it (ncatted -a units,{silent},o,c,m)"
-        raise FormatError(path, f"{silent} says no unit of length, others do; {advice}")
-    scales = np.divide(meters, meters[0]) if meters else np.ones(len(sides))
-    return np.stack(ends, 1) * scales
+    silent = [dimension for dimension, side in sides.items() if side.meters is None]
+    if 0 < len(silent) < len(sides):
+        advice = f"say it (ncatted -a units,{silent[0]},o,c,m)"
+        raise FormatError(path, f"{silent[0]} says no unit of length, others do; {advice}")
+    return np.stack(ends, 1) * (1.0 if silent else np.divide(meters, meters[0]))

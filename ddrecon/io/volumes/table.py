@@ -1,45 +1,123 @@
-"""Volumes by suffix: `FORMATS` is the table; adding a format is one file and one line here."""
+"""Volumes by suffix: `FORMATS` is the table; adding a format is a reader and one line here.
+
+The plainest formats are here themselves: NumPy's archives (.npz) have each field under its own
+name, and its box as `bounds`. Mitsuba's grid volumes (.vol) have a header of 48 bytes, then float32
+values, little-endian, of one field without a name. The header: `VOL`, version 3, then int32 type
+(1: float32), cells along x, y, z and colors, then the box as six float32. Of values, colors run
+fastest, then x.
+"""
 
 from __future__ import annotations
 
+import struct
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields
+from ddrecon.io.files.atomic import replace_file, write_bytes
+from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
+from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields, check_field
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
-from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol
-from ddrecon.io.volumes.vdb_read import read_vdb, vdb_names
-from ddrecon.io.volumes.vdb_write import write_vdb
+from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
+
+BOUNDS = "bounds"
+HEADER = struct.Struct("<3sB5i6f")
+MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
 
 
-@dataclass(frozen=True)
-class VolumeFormat:
+def npz_names(path: Path) -> list[str]:
+    """The names of all arrays of the archive at `path` but `bounds`."""
+    with zipfile.ZipFile(path) as archive:
+        names = (entry.removesuffix(".npy") for entry in archive.namelist())
+        return [name for name in names if name != BOUNDS]
+
+
+def read_npz(path: Path, name: str) -> Field:
+    """The field `name` of the archive at `path`; raises FormatError unless it is a legal one."""
+    with zipfile.ZipFile(path) as archive:
+
+        def read(key: str) -> np.ndarray:
+            entry = archive.getinfo(f"{key}.npy")
+            with archive.open(entry) as stream:
+                return read_npy(stream, entry.file_size, path, key)
+
+        has_bounds = f"{BOUNDS}.npy" in archive.namelist()
+        return check_field(path, name, read(name), read(BOUNDS) if has_bounds else None)
+
+
+def write_npz(path: Path, fields: Fields, bounds: np.ndarray, _: Facts) -> None:
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, compressed.
+
+    `bounds` [2, 3] are the corners (x, y, z) of the box [u].
+    """
+    arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()}
+    with replace_file(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **(arrays | {BOUNDS: bounds}))
+
+
+def read_vol(path: Path, name: str) -> Field:
+    """The field in the file at `path`, taken for `name`; raises FormatError unless it is legal."""
+    check_size(path.stat().st_size, path, "the volume")
+    data = path.read_bytes()
+    if len(data) < HEADER.size or data[:3] != MAGIC:
+        raise FormatError(path, "not a Mitsuba volume: it does not begin with 'VOL' and a header")
+    _, version, kind, x, y, z, colors, *corners = HEADER.unpack_from(data)
+    if (version, kind) != (VERSION, FLOAT32):
+        readable = f"only version {VERSION} with float32 values (type {FLOAT32}) can be read"
+        raise FormatError(path, f"is of version {version} and type {kind}; {readable}")
+    if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
+        cells_text = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
+        raise FormatError(path, f"is damaged: its header says {cells_text}")
+    values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
+    return check_field(path, name, values, np.array(corners).reshape(2, 3))
+
+
+def write_vol(path: Path, fields: Fields, bounds: np.ndarray, _: Facts) -> None:
+    """Writes the one of `fields`, [z, y, x] or [z, y, x, C], and its box, both as float32.
+
+    `bounds` [2, 3] are the corners (x, y, z) [u]. Raises FormatError for several fields.
+    """
+    if len(fields) != 1:
+        names = ", ".join(fields)
+        advice = "write each into a file of its own"
+        raise FormatError(path, f"a {path.suffix} holds one field, not {names}; {advice}")
+    (values,) = map(as_float32, fields.values())
+    z, y, x = values.shape[:3]
+    header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, values[0, 0, 0].size, *bounds.ravel())
+    write_bytes(path, header + values.astype("<f4", copy=False).tobytes())
+
+
+class VolumeFormat(NamedTuple):
     """How one kind of volume file is read and written.
 
-    Without `names`, a file holds one field and does not name it; without `write` it is only read,
-    and with `has_metadata` facts about fields are written.
+    Without `names`, a file holds one field and does not name it; without `write` it is only read.
     """
 
-    write: Callable[..., None] | None
+    write: Callable[[Path, Fields, np.ndarray, Facts], None] | None
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
-    has_metadata: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, True),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
 """The suffixes of formats that are written."""
+
+
+def _format_of(path: Path) -> VolumeFormat:
+    if (suffix := path.suffix.lower()) not in FORMATS:
+        suffixes = ", ".join(FORMATS)
+        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {suffixes}")
+    return FORMATS[suffix]
 
 
 def field_names(path: Path) -> list[str]:
@@ -101,17 +179,9 @@ def write_fields(
     `facts` are written where the format takes any. Raises FormatError where it holds but one field,
     or is not written.
     """
-    kind = _format_of(path)
-    if (write := kind.write) is None:
+    if (write := _format_of(path).write) is None:
         raise FormatError(path, f"{path.suffix} is read, not written: take {', '.join(WRITTEN)}")
-    write(path, fields, np.asarray(bounds, np.float64), *[facts or {}] * kind.has_metadata)
-
-
-def _format_of(path: Path) -> VolumeFormat:
-    if (suffix := path.suffix.lower()) not in FORMATS:
-        suffixes = ", ".join(FORMATS)
-        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {suffixes}")
-    return FORMATS[suffix]
+    write(path, fields, np.asarray(bounds, np.float64), facts or {})
 
 
 def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
@@ -119,25 +189,23 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
 
     Raises FormatError for volumes of different cells or boxes, and for none at all.
     """
-    fields: dict[str, Field] = {}
+    fields, first = dict[str, Field](), None
     for path in sources:
         stored, reasons = read_fields(path)
         for reason in reasons.values():
             warnings.warn(f"{path}: left out: {reason}", DataWarning, 2)
         for name, field in stored.items():
+            first = field if first is None else first
             if name in fields:
                 raise FormatError(path, f"has a field {name!r}, and so has a file before it")
-            fields[name] = field
             if field.bounds is None:
                 raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
-            places = {_place(stored_field) for stored_field in fields.values()}
-            if len(places) > 1:
-                ours, theirs = _place(field), _place(next(iter(fields.values())))
+            if (ours := _place(field)) != (theirs := _place(first)):
                 raise FormatError(path, f"has {ours}, the first field {theirs}")
-    if not fields:
+            fields[name] = field
+    if first is None or first.bounds is None:
         raise FormatError(sources[0], "has no fields")
-    assert field.bounds is not None
-    return {name: stored_field.values for name, stored_field in fields.items()}, field.bounds
+    return {name: field.values for name, field in fields.items()}, first.bounds
 
 
 def _place(field: Field) -> str:

@@ -10,15 +10,13 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ddrecon.io.files.arrays import check_size
-from ddrecon.io.volumes.blosc import unpack_blosc
+from ddrecon.errors import FormatError
 
 LEAF, LOWER, UPPER = 3, 4, 5
 """Log2 of the children along an axis, of a leaf and the nodes above: OpenVDB's standard tree."""
@@ -30,14 +28,20 @@ NODE_MASKS = 222
 """The version of files since which nodes say what is left out of their values."""
 ALL_VALUES = 6
 """What such a node says that leaves nothing out."""
+NOWHERE = np.array([[2**40] * 3, [-(2**40)] * 3])
+"""A box that holds nothing."""
+CODECS = ("BloscLZ", "LZ4", "Snappy", "zlib", "Zstandard")
+IS_SHUFFLED, IS_STORED, IS_SHUFFLED_BY_BITS, IS_WHOLE = 1, 2, 4, 16
+"""Flags of Blosc."""
+MOST_STREAMS, LEAST_STREAM = 16, 128
+"""Blosc splits blocks into so many streams at most, of so many bytes at least."""
 
 
 class Stream:
-    """The bytes of the file at `path`, from the place `at` on; ValueError where they end."""
+    """The bytes `data` of the file at `path`, from the place `at` on; ValueError where they end."""
 
-    def __init__(self, path: Path):
-        check_size(path.stat().st_size, path, "the file")
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+    def __init__(self, path: Path, data: bytes, at: int = 0):
+        self.path, self.data, self.at = path, data, at
 
     def read(self, count: int) -> bytes:
         start, self.at = self.at, self.at + count
@@ -67,8 +71,7 @@ class Stream:
         return np.unpackbits(self.array(np.dtype(np.uint8), count // 8), bitorder="little") > 0
 
 
-@dataclass(frozen=True)
-class Coding:
+class Coding(NamedTuple):
     """How the values of a tree are stored: in a file of `version`, compressed as `flags` say.
 
     A value has `components` numbers, of the type `stored` where there are many, and `single` where
@@ -82,8 +85,7 @@ class Coding:
     components: int
 
 
-@dataclass(frozen=True)
-class Nodes:
+class Nodes(NamedTuple):
     """Cubes of `side` voxels from `corners` [n, 3] on: tiles of `values` [n, C], or leaves without.
 
     `is_active` is [n] for tiles, and for leaves [n, 512].
@@ -95,23 +97,16 @@ class Nodes:
     values: np.ndarray | None = None
 
     def measure(self) -> np.ndarray:
-        """The box [2, 3] of what is active, from its first voxels to behind its last.
-
-        Without any, the first are behind the last.
-        """
+        """The box [2, 3] of what is active, from its first voxels to behind its last."""
         is_some = self.is_active if self.is_active.ndim == 1 else self.is_active.any(1)
-        corners, ends = self.corners[is_some], self.corners[is_some] + self.side
+        corners = self.corners[is_some]
+        ends = corners + self.side
         if self.values is None:
             blocks = self.is_active[is_some].reshape(-1, SIDE, SIDE, SIDE)
-            starts = corners
             along = [np.asarray(blocks.any(others)) for others in ((2, 3), (1, 3), (1, 2))]
-            corners = starts + np.stack([active.argmax(1) for active in along], 1)
-            ends = starts + SIDE - np.stack([active[:, ::-1].argmax(1) for active in along], 1)
+            ends = ends - np.stack([active[:, ::-1].argmax(1) for active in along], 1)
+            corners = corners + np.stack([active.argmax(1) for active in along], 1)
         return np.stack([corners.min(0), ends.max(0)]) if len(corners) else NOWHERE
-
-
-NOWHERE = np.array([[2**40] * 3, [-(2**40)] * 3])
-"""A box that holds nothing."""
 
 
 def join(box: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -137,22 +132,22 @@ class Tree:
 
     def read_many(self, count: int) -> np.ndarray:
         """The next `count` values, [count, C]."""
-        stream, stored = self.stream, self.coding.stored
-        size = count * self.coding.components * stored.itemsize
-        if not self.coding.flags & (ZIP | BLOSC):
+        stream, (_, flags, stored, single, components) = self.stream, self.coding
+        size = count * components * stored.itemsize
+        if not flags & (ZIP | BLOSC):
             data = stream.read(size)
-        elif not count and stored != self.coding.single:
+        elif not count and stored != single:
             data = b""  # of no halves there is not even a length
         else:
             (packed,) = stream.unpack("<q")
             data = stream.read(abs(packed))
-            if packed > 0 and self.coding.flags & BLOSC:
+            if packed > 0 and flags & BLOSC:
                 data = unpack_blosc(stream.path, data, size)
             elif packed > 0:
                 data = zlib.decompressobj().decompress(data, size + 1)  # no more, of a bomb
         if len(data) != size:
             raise ValueError(f"values of {size} bytes have {len(data)}")
-        return np.frombuffer(data, stored).reshape(count, self.coding.components)
+        return np.frombuffer(data, stored).reshape(count, components)
 
     def read_masked(self, is_active: np.ndarray) -> np.ndarray:
         """The next values of a node or leaf, [n, C]; those that are not active may be left out.
@@ -180,17 +175,12 @@ class Tree:
 
         Whoever takes them leaves the place in the stream alone.
         """
-        stream = self.stream
+        stream, components = self.stream, self.coding.components
         stream.at = self.begin
         tiles, roots = stream.unpack("<II")
-        layout = [
-            ("corner", "<i4", 3),
-            ("value", self.coding.single, (self.coding.components,)),
-            ("is_active", "u1"),
-        ]
-        table = stream.array(np.dtype(layout), tiles)
-        values = table["value"].reshape(tiles, self.coding.components)
-        side = SIDE << LOWER + UPPER
+        layout = [("corner", "<i4", 3), ("value", self.coding.single, (components,))]
+        table = stream.array(np.dtype([*layout, ("is_active", "u1")]), tiles)
+        values, side = table["value"].reshape(tiles, components), SIDE << LOWER + UPPER
         yield Nodes(table["corner"].astype(int), side, table["is_active"] > 0, values)
         for _ in range(roots):
             yield from self.read_node(np.array(stream.unpack("<3i")), UPPER, LOWER, LEAF)
@@ -205,16 +195,11 @@ class Tree:
         else:
             values = self.read_masked(is_active)
         is_tile = ~is_child & (is_active | (values != self.background).any(1))
-
-        def corners_of(is_chosen: np.ndarray) -> np.ndarray:
-            places = np.unravel_index(np.flatnonzero(is_chosen), [2**size] * 3)
-            return corner + side * np.stack(places, 1)
-
-        yield Nodes(corners_of(is_tile), side, is_active[is_tile], values[is_tile])
-        children = corners_of(is_child)
+        corners = corner + side * np.indices([2**size] * 3).reshape(3, -1).T
+        yield Nodes(corners[is_tile], side, is_active[is_tile], values[is_tile])
+        children = corners[is_child]
         if len(below) == 1:
-            masks = stream.bits(VOXELS * len(children)).reshape(-1, VOXELS)
-            yield Nodes(children, side, masks)
+            yield Nodes(children, side, stream.bits(VOXELS * len(children)).reshape(-1, VOXELS))
         else:
             for child in children:
                 yield from self.read_node(child, *below)
@@ -233,8 +218,7 @@ class Tree:
                 leaves += starts
                 continue
             for start, value in zip(starts, nodes.values, strict=True):
-                place, _ = _overlap(start, nodes.side, values.shape)
-                values[place] = value
+                values[_overlap(start, nodes.side, values.shape)[0]] = value
         for start in leaves:
             is_active, buffers = self.stream.bits(VOXELS), 1
             if self.coding.version < NODE_MASKS:
@@ -246,12 +230,6 @@ class Tree:
                 self.read_many(VOXELS)
 
 
-def check_box(path: Path, name: str, box: np.ndarray, components: int) -> None:
-    """Raises FormatError where float32 values in a `box` [2, 3] take too much memory."""
-    x, y, z = (int(side) for side in box[1] - box[0])
-    check_size(4 * components * x * y * z, path, f"{name}, of {x} x {y} x {z} voxels,")
-
-
 def _overlap(start: list[int], side: int, shape: tuple[int, ...]) -> tuple[Any, Any]:
     """Where a cube of `side` voxels from `start` on meets an array of `shape`: there, and in it."""
     place, inside = [], []
@@ -261,3 +239,77 @@ def _overlap(start: list[int], side: int, shape: tuple[int, ...]) -> tuple[Any, 
         place.append(slice(low, high))
         inside.append(slice(low - first, high - first))
     return tuple(place), tuple(inside)
+
+
+def unpack_blosc(path: Path, packed: bytes, size: int) -> bytes:
+    """The `size` bytes in a chunk of Blosc 1, of the file at `path`: LZ4, bytes shuffled.
+
+    A chunk has a header, then where each of its blocks begins. A block is one stream of LZ4 or,
+    split, one for each byte of a number; a stream begins with its length. Before packing, the bytes
+    of numbers were sorted: first the first byte of each, and so on. Raises FormatError where they
+    are packed by other means, and ValueError where the chunk is damaged.
+    """
+    chunk = Stream(path, packed)
+    flags, width, unpacked_size, block, _ = chunk.unpack("<2x2B3I")
+    if unpacked_size != size or not width or not block:
+        raise ValueError(f"a packed chunk of {size} bytes has {unpacked_size}")
+    if flags & IS_STORED or not size:
+        return packed[chunk.at : chunk.at + size]
+    codec = CODECS[flags >> 5] if flags >> 5 < len(CODECS) else f"codec {flags >> 5}"
+    if codec != "LZ4" or flags & IS_SHUFFLED_BY_BITS:
+        order = " with bits shuffled" if flags & IS_SHUFFLED_BY_BITS else ""
+        raise FormatError(path, f"is packed by Blosc's {codec}{order}; LZ4 alone is read")
+    unpacked, begins = bytearray(), chunk.unpack(f"<{-(-size // block)}I")
+    for start, chunk.at in zip(range(0, size, block), begins, strict=True):
+        length = min(block, size - start)
+        is_split = not flags & IS_WHOLE and length == block and width <= MOST_STREAMS
+        streams = width if is_split and length // width >= LEAST_STREAM else 1
+        data, share = bytearray(), length // streams
+        for _ in range(streams):
+            stream = chunk.read(*chunk.unpack("<I"))
+            data += stream if len(stream) == share else unpack_lz4(stream, share)
+        if len(data) != length:
+            raise ValueError(f"a block of {length} bytes has {len(data)}")
+        if flags & IS_SHUFFLED and width > 1:
+            sorted_bytes = np.frombuffer(data, np.uint8, length // width * width)
+            data[: len(sorted_bytes)] = sorted_bytes.reshape(width, -1).T.tobytes()
+        unpacked += data
+    return bytes(unpacked)
+
+
+def unpack_lz4(packed: bytes, size: int) -> bytearray:
+    """The `size` bytes of an LZ4 block; raises ValueError or IndexError where it is damaged.
+
+    It is a row of sequences. A sequence has a token, of which half a byte is how many literals
+    follow, and half how many bytes are then repeated from before; the last has literals alone.
+    """
+    data, at = bytearray(), 0
+    while True:
+        token = packed[at]
+        at, count = at + 1, token >> 4
+        if count == 15:
+            at, count = _extend(packed, at, count)
+        data += packed[at : at + count]
+        at += count
+        if at >= len(packed):
+            break
+        distance = packed[at] | packed[at + 1] << 8
+        at, count = at + 2, token & 15
+        if count == 15:
+            at, count = _extend(packed, at, count)
+        count += 4
+        if not 0 < distance <= len(data) or len(data) + count > size:
+            raise ValueError("a packed chunk is damaged")
+        start = len(data) - distance
+        # What is repeated may overlap what it makes: then it is a period.
+        data += (data[start : start + count] * -(-count // distance))[:count]
+    if len(data) != size:
+        raise ValueError(f"a packed stream of {size} bytes has {len(data)}")
+    return data
+
+
+def _extend(packed: bytes, at: int, count: int) -> tuple[int, int]:
+    """Where a long `count` ends that goes on at the place `at`, and how much it is."""
+    while packed[at] == 255:
+        at, count = at + 1, count + 255
+    return at + 1, count + packed[at]

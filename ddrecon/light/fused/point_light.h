@@ -67,14 +67,17 @@ template <class F, int BLOCK> struct Ways {
     }
 
     // Adds to the field's cotangent, from that of `total`.
-    INLINE void integrate_back(int item, const F* total, F* field_bar) const {
+    INLINE void integrate_back(
+        int item, const F* total, const double* bounds, Sum<F>* field_bar) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
             const F* __restrict bar = total + (long long)channel * ways + begin;
-            F* const bars = field_bar + channel * cells();
+            Sum<F>* const bars = field_bar + channel * cells();
+            const F scale = IS_GPU ? scale_of<F>(bounds[channel]) : F(1);
             F sample_bar[BLOCK], z[BLOCK], y[BLOCK], x[BLOCK];
             int at[BLOCK];
-            for (int t = 0; t < count; ++t) sample_bar[t] = bar[t] * length[begin + t] / F(samples);
+            for (int t = 0; t < count; ++t)
+                sample_bar[t] = bar[t] * length[begin + t] / F(samples) * scale;
             for (int i = 0; i < samples; ++i) {
                 for (int t = 0; t < count; ++t) {
                     const Corners around = corners(i, begin + t);
@@ -84,7 +87,7 @@ template <class F, int BLOCK> struct Ways {
                     const Corners around = {at[t], z[t], y[t], x[t]};
                     UNROLLED
                     for (int k = 0; k < 8; ++k)
-                        add_to(bars + cell(around, k), weight(around, k) * sample_bar[t]);
+                        add_to<F>(bars + cell(around, k), weight(around, k) * sample_bar[t]);
                 }
             }
         }

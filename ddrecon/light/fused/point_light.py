@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import count_shares, launch_later, thread_count
+from ddrecon.kernels.launch import launch_later
+from ddrecon.kernels.sums import Sums, type_of_sums
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -46,7 +47,7 @@ class _Integral(torch.autograd.Function):
         field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
     ) -> Tensor:
         if field.requires_grad:
-            launch_later(way_kernel(True, 8 * field.itemsize).kernel, field)
+            launch_later(way_kernel(type_of_sums(field), 8 * field.itemsize).kernel, field)
         return _integrate(field, first, last, length, fraction)
 
     @staticmethod
@@ -57,13 +58,15 @@ class _Integral(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor | None, ...]:
         field, *ways = ctx.saved_tensors
-        # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        threads = count_shares(thread_count(field), field.nbytes)
-        bars = [{"field_bar": field.new_zeros(field.shape)} for _ in range(threads)]
         items, _ = cut(len(ways[2]), BLOCK, field)
-        arguments = _ways(field, *ways) | {"total": total_bar}
-        way_kernel(True, 8 * field.itemsize).launch(items, arguments, bars[0], shares=bars)
-        field_bar = functools.reduce(Tensor.add_, (bar["field_bar"] for bar in bars))
+        sums, bounds = Sums([field.shape], field), None
+        if field.is_cuda:
+            bounds = (total_bar * ways[2]).abs().sum(1, dtype=torch.float64)
+        arguments = _ways(field, *ways) | {"total": total_bar, "bounds": bounds}
+        way_kernel(type_of_sums(field), 8 * field.itemsize).launch(
+            items, arguments, {}, shares=[{"field_bar": bar} for (bar,) in sums.copies]
+        )
+        (field_bar,) = sums.total(bounds, field[0].numel())
         return field_bar, None, None, None, None
 
     @staticmethod
@@ -78,7 +81,7 @@ def _integrate(field: Tensor, *ways: Tensor) -> Tensor:
     """The integral of `field` along `ways`."""
     total = field.new_empty(len(field), len(ways[2]))
     items, _ = cut(len(ways[2]), BLOCK, field)
-    way_kernel(False, 8 * field.itemsize).launch(items, _ways(field, *ways), {"total": total})
+    way_kernel("", 8 * field.itemsize).launch(items, _ways(field, *ways), {"total": total})
     return total
 
 
@@ -94,12 +97,12 @@ def _ways(field: Tensor, *ways: Tensor) -> dict[str, Any]:
 
 
 @functools.cache
-def way_kernel(is_adjoint: bool, bits: int) -> TextKernel:
-    """The kernel of integrals along ways; or its adjoint, from cotangents in `total`."""
-    call = "integrate_back(item, total, field_bar)" if is_adjoint else "integrate(item, total)"
+def way_kernel(sums: str, bits: int) -> TextKernel:
+    """The kernel of integrals along ways; of `sums`, their type, its adjoint from `total`."""
+    call = "integrate_back(item, total, bounds, field_bar)" if sums else "integrate(item, total)"
     text = f"Ways<F, IS_GPU ? 1 : {BLOCK}>{{{_SIZES}, {_ARRAYS}}}.{call};"
     declared = f"int {_SIZES}; F *{', *'.join(_ARRAYS.split(', '))}, *total"
-    header, name = "light/fused/point_light.h", f"ways{'_adjoint' * is_adjoint}"
-    if is_adjoint:
-        return TextKernel(name, bits, text, f"{declared}, *field_bar", "field_bar", header)
-    return TextKernel(name, bits, text, declared, "total", header)
+    header, name = "light/fused/point_light.h", f"ways{'_adjoint' * bool(sums)}"
+    if sums:
+        declared += f"; double *bounds; {sums} *field_bar"
+    return TextKernel(name, bits, text, declared, "field_bar" if sums else "total", header)

@@ -133,16 +133,15 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         }
     }
 
-    // Cells of one row of slice k, of which so many are `ghosts` on each side.
+    // Cells of one row of slice k.
     struct Cells {
         int channel, k, row, begin, count;
     };
-    INLINE Cells cells_of(int item, int ghosts = 0) const {
-        const int length = width + 2 * ghosts, lines = height + 2 * ghosts;
-        const int blocks = (length + BLOCK - 1) / BLOCK, begin = item % blocks * BLOCK;
-        const int row = item / blocks % lines, slice = item / blocks / lines;
-        const int count = begin + BLOCK < length ? BLOCK : length - begin;
-        return {slice % channels, slice / channels, row - ghosts, begin - ghosts, count};
+    INLINE Cells cells_of(int item) const {
+        const int blocks = (width + BLOCK - 1) / BLOCK, begin = item % blocks * BLOCK;
+        const int slice = item / blocks / height;
+        const int count = begin + BLOCK < width ? BLOCK : width - begin;
+        return {slice % channels, slice / channels, item / blocks % height, begin, count};
     }
 
     // The mass on rays (E5.9), and the slopes of what of it is bounded.
@@ -253,29 +252,38 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         }
     }
 
-    // Adds those of the field's cells and ghosts, from what `sum_back` has left on rays.
+    // Adds those of the field's cells, from what `sum_back` has left on rays. The outermost cells
+    // stand for the ghosts beyond them.
     INLINE void look_back(int item, const F* slices_bar, const F* midways_bar, F* field_bar) const {
-        const Cells cells = cells_of(item, GHOSTS);
-        F* __restrict out = field_bar + field_row(cells.channel, cells.k, cells.row) + cells.begin;
-        F blended[BLOCK + 1];
+        const Cells cells = cells_of(item);
+        const int above = cells.row ? 0 : GHOSTS, below = cells.row + 1 < height ? 0 : GHOSTS;
+        const int left = cells.begin ? 0 : GHOSTS, end = left + cells.count;
+        const int size = cells.begin + cells.count < width ? end : end + GHOSTS;
+        F* __restrict out = field_bar + cell_row(cells.channel, cells.k, cells.row) + cells.begin;
+        F blended[BLOCK + 2 * GHOSTS + 1], sum[BLOCK + 2 * GHOSTS];
+        clear(sum, size);
         // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that look at the
         // cells.
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
             const Position<F> r = row_place(s + shift), c = column_place(s + shift);
-            const int above = cells.row + r.n - row_place(s).n + 1;
-            const int begin = cells.begin + c.n - column_place(s).n + 1;
-            clear(blended, cells.count + 1);
-            for (int t = 0; t < 2; ++t)
-                if (above + t >= 0 && above + t < height + 3)
-                    add_row(
-                        blended, bars + window_row(cells.channel, s, above + t), begin,
-                        cells.count + 1, width + 3, weight * (t ? r.a : F(1) - r.a));
-            for (int t = 0; t < cells.count; ++t)
-                out[t] += (F(1) - c.a) * blended[t] + c.a * blended[t + 1];
+            const int row = cells.row + r.n - row_place(s).n + 1;
+            const int begin = cells.begin - left + c.n - column_place(s).n + 1;
+            clear(blended, size + 1);
+            for (int m = row - above; m <= row + below; ++m)
+                for (int t = 0; t < 2; ++t)
+                    if (m + t >= 0 && m + t < height + 3)
+                        add_row(
+                            blended, bars + window_row(cells.channel, s, m + t), begin, size + 1,
+                            width + 3, weight * (t ? r.a : F(1) - r.a));
+            for (int t = 0; t < size; ++t)
+                sum[t] += (F(1) - c.a) * blended[t] + c.a * blended[t + 1];
         };
         gather(slices_bar, cells.k, 0, F(1));
         if (cells.k + 1 < slices) gather(midways_bar, cells.k, 0.5, F(0.5));
         if (cells.k > 0) gather(midways_bar, cells.k - 1, 0.5, F(0.5));
+        for (int t = 0; t < cells.count; ++t) out[t] += sum[left + t];
+        for (int t = 0; t < left; ++t) out[0] += sum[t];
+        for (int t = end; t < size; ++t) out[cells.count - 1] += sum[t];
     }
 };
 

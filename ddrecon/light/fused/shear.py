@@ -19,7 +19,7 @@ from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 from ddrecon.light.shear import Shear
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-from ddrecon.numerics.slicing import Slicing
+from ddrecon.numerics.layout import Slicing
 
 GHOSTS = 3
 """Cells beyond the outermost ones that rays look at."""
@@ -32,9 +32,7 @@ def sum_masses(field: Tensor, shears: Sequence[Shear], bound: Tensor) -> Tensor:
 
     As of `light.shear.sum_masses`; differentiated in forward mode by `field` and `bound` alone.
     """
-    fields = [
-        pad(slicing.lay(field), [GHOSTS] * 4, mode="replicate") for slicing in _slicings(shears)
-    ]
+    fields = [slicing.lay(field) for slicing in _slicings(shears)]
     numbers = torch.stack([shear.numbers for shear in shears])
     columns = [*range(3)] * numbers.requires_grad + [3] * bound.requires_grad
     has_adjoint = torch.is_grad_enabled() and (field.requires_grad or bool(columns))
@@ -59,7 +57,8 @@ class _Masses(torch.autograd.Function):
     def forward(
         shears: Sequence[Shear], columns: list[int] | None, numbers: Tensor, *fields: Tensor
     ) -> tuple[Tensor, ...]:
-        laid, slopes = dict(zip(_slicings(shears), fields, strict=True)), list[Tensor]()
+        laid = dict(zip(_slicings(shears), map(_widen, fields), strict=True))
+        slopes = list[Tensor]()
         for name in () if columns is None else ("sum_back", "look_back"):
             launch_later(shear_kernel(name, 8 * numbers.itemsize).kernel, numbers)
         entered = numbers.new_empty(len(shears), fields[0].shape[1], *shears[0].grid.shape)
@@ -73,6 +72,7 @@ class _Masses(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.shears, ctx.columns, *tensors = inputs
         ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
         keep(ctx, *tensors, *output[1:])
 
     @staticmethod
@@ -81,8 +81,9 @@ class _Masses(torch.autograd.Function):
         numbers, *tensors = ctx.saved_tensors
         laid = dict(zip(_slicings(ctx.shears), tensors, strict=False))
         slopes = iter(tensors[len(laid) :])
-        bars = {slicing: torch.zeros_like(field) for slicing, field in laid.items()}
-        numbers_bar = torch.zeros_like(numbers)
+        bars = {slicing: field.new_zeros(field.shape) for slicing, field in laid.items()}
+        # No column varies of beams that stay.
+        numbers_bar = torch.zeros_like(numbers) if ctx.columns else numbers
         for light, shear in enumerate(ctx.shears):
             mass_bar = shear.slicing.lay(entered_bar[light]).contiguous()
             row, field, ray_slopes = numbers[light], laid[shear.slicing], next(slopes)
@@ -98,7 +99,7 @@ class _Masses(torch.autograd.Function):
                 d_row[column].fill_(1)
                 d_mass = _sum_tangent(shear, field, row, torch.zeros_like(field), d_row)
                 numbers_bar[light, column] = (d_mass * mass_bar).sum(dtype=torch.float64)
-        return None, None, numbers_bar, *bars.values()
+        return None, None, numbers_bar if ctx.columns else None, *bars.values()
 
     @staticmethod
     def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -122,6 +123,11 @@ class _Masses(torch.autograd.Function):
         return d_entered, *[None] * (len(ctx.saved_tensors) - count)
 
 
+def _widen(field: Tensor) -> Tensor:
+    """`field` [N, K, rows, columns] with ghosts around each slice, as the outermost cells."""
+    return pad(field, [GHOSTS] * 4, mode="replicate")
+
+
 def _sum(shear: Shear, field: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The mass, and the slopes of its corrections on rays and at cells.
 
@@ -141,8 +147,9 @@ def _sum(shear: Shear, field: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor, 
 def _sum_tangent(
     shear: Shear, field: Tensor, numbers: Tensor, d_field: Tensor, d_numbers: Tensor
 ) -> Tensor:
-    """The change of the mass with those of the field and of `numbers` [4]."""
-    duals = (torch.stack(pair, -1) for pair in ((field, d_field), (numbers, d_numbers)))
+    """The change of the mass with those of the `field`, without ghosts, and of `numbers` [4]."""
+    fields = _widen(field), _widen(d_field)
+    duals = (torch.stack(pair, -1) for pair in (fields, (numbers, d_numbers)))
     return _sum(shear, *duals)[0][..., 1].contiguous()
 
 

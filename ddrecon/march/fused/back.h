@@ -7,13 +7,16 @@
 namespace ddrecon {
 
 // Cotangents of what the walk found, with the masses that it found, and of its arguments: those
-// that are null are not asked for. Each packet has its own `numbers` [2 C + 1, packets].
+// that are null are not asked for. Each packet has its own `numbers` [2 C + 1, packets]. On a GPU
+// `bounds` [CHANNELS + 1] are those of sums, the table's last; where these are asked for, all else
+// is not, and each packet has its own `most` [CHANNELS + 1, packets] of them.
 template <class F> struct Cotangents {
     const F *out, *masses;
-    const double* mass;
-    double* numbers;
-    F *rays, *angles, *table, *fronts;
-    F* const* fields;
+    const double *mass, *bounds;
+    double *most, *numbers;
+    F *rays, *angles, *fronts;
+    Sum<F>* table;
+    Sum<F>* const* fields;
     int packets;
 };
 
@@ -40,6 +43,10 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         curve_bar[VARIES_TABLES * L::HOLDS * L::BEAMS * L::HELD + 1];
     V foot_bar[L::BEAMS + 1], across_bar[L::BEAMS + 1];
     V ray_bar[8] = {zero, zero, zero, zero, zero, zero, zero, zero};
+#if IS_GPU
+    // What shares come to at most; or, once that is known of all packets, their scales.
+    F sizes[L::CHANNELS + 1];
+#endif
 
     Back(int item, const Arguments<F>& arguments, const Cotangents<F>& bars)
         : Rays(item, arguments, {}), bars(bars) {}
@@ -49,20 +56,29 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
         bool is_asked = false;
         for (int i = 0; i < L::OUT; ++i) {
-            bar[i] = inside * P::load(bars.out + row_of(i), begin, 1, last);
+            bar[i] = inside * bar_of(bars.out, i);
             is_asked = is_asked || !this->is_nothing(bar[i]);
         }
         for (int k = 0; k < L::EXTINCTION; ++k) {
-            m_bar[k] = inside * P::load(bars.masses + row_of(k), begin, 1, last);
+            m_bar[k] = inside * bar_of(bars.masses, k);
             m[k] = P::load_wide(bars.mass + row_of(k), begin, last);
             is_asked = is_asked || !this->is_nothing(m_bar[k]);
         }
+#if IS_GPU
+        for (int c = 0; c <= L::CHANNELS; ++c)
+            sizes[c] = bars.most ? F(0) : scale_of<F>(bars.bounds[c]);
+#endif
         for (V& bar : number_bar) bar = zero;
         for (V& bar : curve_bar) bar = zero;
         for (int b = 0; b < L::BEAMS; ++b) foot_bar[b] = across_bar[b] = zero;
         // Pixels that nothing is asked of, masked ones for instance, need no walk.
         if (is_asked) walk(bar, m);
         store();
+    }
+
+    // Row k of an array that has a number of each ray, if any.
+    V bar_of(const F* array, int k) const {
+        return array ? P::load(array + row_of(k), begin, 1, last) : zero;
     }
 
     // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
@@ -180,8 +196,27 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         const V depth = L::HAS_PEAK ? value_of(this->peak_of(node, c)) * passed : zero;
         Polynomials<F, L::TERMS, L::POWERS>::spread(p_bar, depth, number, bar);
         if (is_held) return;
-        const auto place = this->see(b, foot[b], across[b], node.t, cosine);
-        Table::spread(place, bars.table + table * Table::SIZE, bar);
+        spread_table(this->see(b, foot[b], across[b], node.t, cosine), table, bar);
+    }
+    void spread_table(const Cubic<F, V>& place, int table, V* bar) {
+        if (weighs(L::CHANNELS, L::CURVE, bar))
+            Table::spread(place, bars.table + table * Table::SIZE, bar);
+    }
+    // Whether shares `bar` of sums from c on, whose scales are known, are to be added; if not, they
+    // count for these. No share is more than its bar.
+    bool weighs(int c, int count, V* bar) {
+#if IS_GPU
+        for (int k = 0; k < count; ++k) {
+            F& size = sizes[c < L::CHANNELS ? c + k : c];
+            if (bars.most)
+                size += P::size(bar[k]);
+            else
+                bar[k] *= size;
+        }
+        return !bars.most;
+#else
+        return true;
+#endif
     }
     // What bars of beam b's place in tables, and of the cosine there, are for its angles.
     void finish_angles(Node& node, int b, V place_bar, V cosine_bar) {
@@ -193,20 +228,22 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     }
 
     // The values of a node go back to the cells, and where it lies to its rays.
-    void spread(const Node& node) {
+    void spread(Node& node) {
         V bend_bar[L::MASSES + 1];
         for (int k = 0; k < L::MASSES; ++k) {
             const V off = this->number(2 * L::C) * node.bend[k], inverse = node.limit[k];
             bend_bar[k] = -node.v_bar[L::FIRST_MASS + k] * inverse * inverse * inverse;
             number_bar[2 * L::C] -= bend_bar[k] * off * node.bend[k] * node.bend[k];
         }
+        if (MOVES && bars.rays) move(node, bend_bar);
+        weighs(L::FIRST_MASS, L::MASSES, bend_bar);
+        if (!weighs(0, L::CHANNELS, node.v_bar)) return;
         if constexpr (IS_SLICED)
             spread_in_slice<F, L>(
                 bars.fields, this->slice(node.n), node.runs, node.y, node.x, lines, node.v_bar,
                 bend_bar);
         else
             spread_between(node, bend_bar);
-        if (MOVES && bars.rays) move(node, bend_bar);
     }
     void spread_between(const Node& node, const V* bend_bar) const {
         for (int i = 0; i < 4; ++i) {
@@ -272,6 +309,14 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             array[row_of(k) + begin + l] = P::lane(bar, l);
     }
     void store() {
+        for (int b = 0; b < L::BEAMS && VARIES_TABLES && L::HOLDS; ++b)
+            for (int h = 0; h < L::TABLES && L::has_curve(b) && !L::is_point(b); ++h)
+                spread_table(Cubic<F, V>(foot[b]), h, curve_bar + b * L::HELD + h * L::CURVE);
+#if IS_GPU
+        for (int c = 0; c <= L::CHANNELS && bars.most; ++c)
+            bars.most[c * bars.packets + this->item] = sizes[c];
+        if (bars.most) return;
+#endif
         for (int k = 0; k <= 2 * L::C; ++k)
             bars.numbers[k * bars.packets + this->item] = P::sum(number_bar[k]);
         if (MOVES && bars.rays) {
@@ -288,11 +333,6 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             put(bars.angles, L::BEAMS + b, across_bar[b]);
         }
         for (int k = 0; k < L::EXTINCTION && bars.fronts; ++k) put(bars.fronts, k, m_bar[k]);
-        for (int b = 0; b < L::BEAMS && VARIES_TABLES && L::HOLDS; ++b)
-            for (int h = 0; h < L::TABLES && L::has_curve(b) && !L::is_point(b); ++h)
-                Table::spread(
-                    Cubic<F, V>(foot[b]), bars.table + h * Table::SIZE,
-                    curve_bar + b * L::HELD + h * L::CURVE);
     }
 };
 

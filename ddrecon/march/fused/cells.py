@@ -20,8 +20,8 @@ from torch import Tensor
 from ddrecon.kernels.launch import MOST, too_many
 from ddrecon.kernels.text import LANES, TextKernel, cut
 from ddrecon.march.samplers import Sampler, order_of_slices, support_of_planes
+from ddrecon.numerics.layout import across
 from ddrecon.numerics.remember import remember
-from ddrecon.numerics.slicing import across
 
 BITS = 32
 """Segments in a word; segment n lies between nodes n - 1 and n."""

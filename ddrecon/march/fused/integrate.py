@@ -6,18 +6,21 @@ It is one differentiable function of tensors.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.kernels.launch import count_shares, launch_later, thread_count
+from ddrecon.grid import Grid
+from ddrecon.kernels.launch import launch_later, thread_count
+from ddrecon.kernels.sums import Sums, type_of_sums
 from ddrecon.kernels.text import LANES, cut
+from ddrecon.light.beam import Beam
 from ddrecon.march.box import Crossing
-from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
     Case,
@@ -29,6 +32,9 @@ from ddrecon.march.fused.kernels import (
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import Sampler
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.layout import across
+from ddrecon.numerics.remember import remember
+from ddrecon.numerics.series import STEPS, angle_of
 
 NEIGHBORS, TURNS = 128, 8
 """Packets that one thread does after each other, at least, as they meet the same cells; and how
@@ -92,7 +98,8 @@ class Integrate(torch.autograd.Function):
         outputs["masses"] = outputs["masses"].double()
         packets, arguments = _arguments(cells, tensors, thread_count(rays))
         if any(needs := [tensor.requires_grad for tensor in tensors]):
-            launch_later(adjoint_kernel(layout, _case(layout, cells, needs)).kernel, rays)
+            case = _case(layout, cells, needs)
+            launch_later(adjoint_kernel(layout, case, type_of_sums(rays)).kernel, rays)
         integral_kernel(layout, cells.is_sliced).launch(packets, arguments, outputs)
         out, masses = outputs.values()
         return out, masses.to(rays.dtype, copy=True), masses
@@ -110,41 +117,41 @@ class Integrate(torch.autograd.Function):
         """Cotangents of the tensors that need them; of numbers always."""
         (masses, *tensors), needs = ctx.saved_tensors, ctx.needs_input_grad[2:]
         rays, numbers, fields = tensors[0], tensors[2], tensors[len(NAMES) :]
-        bars = [
-            tensor.new_zeros(tensor.shape) if is_needed and tensor.numel() else None
+        shapes = [
+            tensor.shape if is_needed and tensor.numel() else None
             for tensor, is_needed in zip(tensors, needs, strict=True)
         ]
-        rays_bar, angles_bar, _, table_bar, fronts_bar, *field_bars = bars
-
-        # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        sums = [table_bar, *field_bars]
-        size = sum(total.nbytes for total in sums if total is not None)
-        threads = count_shares(thread_count(rays), size)
-        shares = [sums] + [
-            [None if total is None else torch.zeros_like(total) for total in sums]
-            for _ in range(threads - 1)
-        ]
-        packets, arguments = _arguments(ctx.cells, tensors, threads)
+        rays_bar, angles_bar, fronts_bar = (
+            None if shapes[i] is None else rays.new_zeros(shapes[i]) for i in (0, 1, 4)
+        )
+        sums = Sums([*shapes[len(NAMES) :], shapes[3]], rays)
+        packets, arguments = _arguments(ctx.cells, tensors, len(sums.copies))
         arguments |= {"masses": masses, "packets": packets}
-        outputs = _empty_outputs(ctx.layout, rays).items()
-        for (name, empty), bar in zip(outputs, output_bars, strict=False):
-            arguments[f"{name}_bar"] = empty.zero_() if bar is None else bar
+        arguments |= dict(zip(("out_bar", "masses_bar"), output_bars, strict=False))
+        kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs), type_of_sums(rays))
+        bounds = None
+        if rays.is_cuda:
+            most = masses.new_empty(ctx.layout.channels + 1, packets)
+            kernel.launch(packets, arguments, {"most": most})
+            bounds = arguments["bounds"] = most.sum(1)
+            asked = [shape is not None for shape in shapes[len(NAMES) :]]
+            if not all(asked):
+                parts = bounds.split([*map(len, fields), 1])
+                bounds = torch.cat([*itertools.compress(parts, asked), parts[-1]])
         numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
         results = {"rays_bar": rays_bar, "angles_bar": angles_bar, "fronts_bar": fronts_bar}
-        adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs)).launch(
+        kernel.launch(
             packets,
             arguments,
             results | {"numbers_bar": numbers_bar},
             shares=[
-                {"table_bar": of_table, "bars": _channels(of_fields, fields)}
-                for of_table, *of_fields in shares
+                {"bars": _channels(of_fields, fields), "table_bar": of_table}
+                for *of_fields, of_table in sums.copies
             ],
         )
-        for share in shares[1:]:
-            for total, addend in zip(sums, share, strict=True):
-                if total is not None and addend is not None:
-                    total += addend
-        bars[2] = numbers_bar.sum(1).to(numbers.dtype)
+        *field_bars, table_bar = sums.total(bounds, fields[0][0].numel())
+        of_numbers = numbers_bar.sum(1).to(numbers.dtype)
+        bars = rays_bar, angles_bar, of_numbers, table_bar, fronts_bar, *field_bars
         return None, None, *bars
 
     @staticmethod
@@ -225,3 +232,76 @@ def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[
         for tensor, field in zip(tensors, like, strict=True)
         for channel in ([None] * len(field) if tensor is None else tensor.unbind())
     ]
+
+
+class Packed(NamedTuple):
+    """Rays: `bundle` [R, 8] as of `Arguments` in `rays.h`; `origin` and `direction` [R, 3] in u."""
+
+    bundle: Tensor
+    origin: Tensor
+    direction: Tensor
+
+
+@remember
+def pack_rays(
+    grid: Grid,
+    axis: int | None,
+    origin: Tensor,
+    direction: Tensor,
+    hit: Tensor,
+    near: Tensor,
+    far: Tensor,
+) -> Packed:
+    """Those rays that `hit` the box, by slices across `axis` unless that is None.
+
+    Origins and directions in cells, counted from centers of the layers that fields begin with;
+    `near` and `far` [u]. For slices the coordinate across them comes first, in u, then those of
+    rows and columns.
+    """
+    origin, direction = origin[hit], direction[hit]
+    spacing = origin.new_tensor(grid.spacing)
+    places = (origin - origin.new_tensor(grid.lower)) / spacing + 0.5
+    speeds = direction / spacing
+    if axis is not None:
+        order = list(across(axis))
+        places = torch.cat([origin[:, [axis]], places[:, order]], 1)
+        speeds = torch.cat([direction[:, [axis]], speeds[:, order]], 1)
+    bundle = torch.cat([places, speeds, near[:, None], far[:, None]], 1)
+    return Packed(bundle, origin, direction)
+
+
+def see_beams(outgoing: OutgoingLight, packed: Packed) -> Tensor:
+    """The `angles` [2 beams, R] at which rays see beams, as of `Arguments` in `rays.h`."""
+    angles = [
+        _see_beam(packed.direction, beam.direction)
+        if isinstance(beam, Beam)
+        else torch.stack(beam.passing(packed.origin, packed.direction))
+        for beam in outgoing.beams
+    ]
+    if not angles:
+        return packed.direction.new_empty(0, len(packed.direction))
+    return torch.stack(angles, 1).flatten(0, 1)
+
+
+@remember
+def _see_beam(direction: Tensor, towards: Tensor) -> Tensor:
+    """The angle in steps of tables, and its cosine [2, R]; of light along `towards`."""
+    cosine = -(direction @ towards)
+    return torch.stack([(angle_of(cosine) * (STEPS / math.pi)).to(cosine), cosine])
+
+
+def table_of(outgoing: OutgoingLight, layout: Layout) -> Tensor:
+    """The tables that kernels read, [tables * (steps + 1) * 2, K]; none where p is constant."""
+    if not layout.has_curves:
+        return outgoing.diffuse.new_empty(0, 1)
+    return outgoing.seen.table(layout.peak >= 0).to(outgoing.diffuse).flatten(0, 2)
+
+
+def numbers_of(outgoing: OutgoingLight) -> Tensor:
+    """The scale and the peak of each color, and the bound of third-order corrections."""
+    scale = outgoing.extinction.scale.view(-1).expand(outgoing.colors)
+    peak = outgoing.peak
+    if peak is None or "peak" in outgoing.fields:
+        peak = torch.zeros_like(scale)
+    bound = torch.as_tensor(outgoing.extinction.mass_bound if outgoing.beams else 0.0)
+    return torch.cat([scale, peak.view(-1).expand_as(scale), bound.to(scale).view(1)])

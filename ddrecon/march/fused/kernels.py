@@ -128,22 +128,23 @@ def tangent_kernel(layout: Layout, case: Case) -> TextKernel:
 
 
 @functools.cache
-def adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
+def adjoint_kernel(layout: Layout, case: Case, sums: str) -> TextKernel:
     """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
     Those that are not asked for are left out, as are those of other arguments. Each packet has its
-    own `numbers_bar` [2 C + 1, packets].
+    own `numbers_bar` [2 C + 1, packets]. On a GPU, where `sums` are "long", it is launched twice,
+    first for `most` alone, which comes to the `bounds`.
     """
     declared = f"""
-    F *out_bar, *masses_bar; double *masses, *numbers_bar;
-    F *rays_bar, *angles_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
+    F *out_bar, *masses_bar; double *masses, *bounds, *most, *numbers_bar;
+    F *rays_bar, *angles_bar, *fronts_bar; {sums} *table_bar, *bars[{layout.channels}];
     int packets
     """
     text = f"""
     const Cotangents<F> cotangents = {{{names_of(declared)}}};
     Back<F, {_types(layout, case)}>(item, arguments, cotangents).run();
     """
-    outputs = "numbers_bar rays_bar angles_bar table_bar fronts_bar bars"
+    outputs = "most numbers_bar rays_bar angles_bar table_bar fronts_bar bars"
     return _kernel("transpose", layout, 1, text, declared, outputs, "back")
 
 

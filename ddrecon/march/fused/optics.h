@@ -2,7 +2,7 @@
 #include "ddrecon/kernels/dual.h"
 #include "ddrecon/kernels/packets.h"
 // The formulas of the view-ray integral for packets: those of `numerics/decay.py`,
-// `numerics/chebyshev.py`, `numerics/angle_table.py`, `light/point_light.py` and
+// `numerics/series.py`, `light/point_light.py` and
 // `medium/phase_peak.py`, whose constants these are.
 
 namespace ddrecon {
@@ -200,13 +200,13 @@ template <class F, int COUNT> struct Table {
         }
     }
     // What bars of these are for the table.
-    static INLINE void spread(const Cubic<F, V>& angle, F* table_bar, const V* bar) {
+    static INLINE void spread(const Cubic<F, V>& angle, Sum<F>* table_bar, const V* bar) {
         V weights[4];
         angle.weigh(weights);
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < 4; ++j)
                 for (int k = 0; k < COUNT; ++k)
-                    add_to(
+                    add_to<F>(
                         table_bar + (2 * P::lane_of(angle.first, l) + j) * COUNT + k,
                         P::lane(weights[j], l) * P::lane(bar[k], l));
     }

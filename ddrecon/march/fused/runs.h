@@ -16,8 +16,8 @@ template <class F> struct Runs {
     template <class Place> INLINE void find(const Place&, const Place&, const Lines&) {}
 };
 template <class F, class L> INLINE void spread_in_slice(
-    F* const* fields, long long offset, const Runs<F>&, const Place<F, F>& y, const Place<F, F>& x,
-    const Lines& lines, const F* v_bar, const F* bend_bar) {
+    Sum<F>* const* fields, long long offset, const Runs<F>&, const Place<F, F>& y,
+    const Place<F, F>& x, const Lines& lines, const F* v_bar, const F* bend_bar) {
     for (int c = 0; c < L::CHANNELS; ++c) {
         if (!fields[c]) continue;
         const F bar = v_bar[c], curved = L::is_cubic(c) ? bend_bar[c - L::FIRST_MASS] : F(0);
@@ -26,7 +26,7 @@ template <class F, class L> INLINE void spread_in_slice(
                 const F share = y.linear(r) * (bar * x.linear(i) + curved * x.bend(i)) +
                                 y.bend(r) * curved * x.linear(i);
                 const int cell = y.cells[r] * lines.row + x.cells[i] * lines.column;
-                if (share != F(0)) add_to(fields[c] + offset + cell, share);
+                if (share != F(0)) add_to<F>(fields[c] + offset + cell, share);
             }
     }
 }

@@ -17,8 +17,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, names_of
+from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
@@ -301,3 +304,39 @@ class _Sweep(torch.autograd.Function):
 
 def _launches(of: Ordinates, *fields: Any) -> Any:
     return (_ByRows if of[2] is None else _ByCells)(of, *fields)
+
+
+def gain_fused(
+    medium: Medium,
+    change: Tensor,
+    off: tuple[Tensor, Tensor | None] | None,
+    cosine: Tensor,
+    damping: float,
+    step: tuple[float, float],
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What of a sweep counts (E2.10, E2.8), as `_gain` in `rounds.py`.
+
+    `step`: the mean one, by which theta is (E7.2).
+    """
+    extinction, scattering = medium.extinction.field, medium.remaining.field
+    has_flux, (z, y, x) = len(change) > 1, medium.grid.shape
+    is_so = has_flux, scattering is extinction, off is not None
+    fields = [extinction] if scattering is extinction else [extinction, scattering]
+    fields += [field for field in (change, *(off or ())) if field is not None]
+    strength, moments = medium.remaining.scale, remaining_moments(medium)
+    p_1 = moments[1] if len(moments) > 1 else torch.zeros_like(strength)
+    length, shared = step
+    depth, turned = length * medium.extinction.scale, length * p_1 * strength
+    lag = torch.full_like(depth, shared)
+    numbers = depth, lag, damping * depth, damping * turned, strength, cosine
+    colors = max(*map(Tensor.numel, numbers), *(field.shape[-4] for field in fields))
+    cells = colors, z, y, x
+    function = RowFunction(
+        "transport/fused/gain.h",
+        f"Gain<{', '.join(str(int(flag)) for flag in is_so)}>",
+        (cells, (len(change), *cells), *[(3, *cells)] * has_flux),
+        y * x,
+    )
+    rows = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
+    source, gain, *more = function.apply(rows, *fields)
+    return gain, source, more[0] if more else None
