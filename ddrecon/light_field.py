@@ -48,7 +48,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.bounced import reflected_light
 from ddrecon.transport.rounds import face_mirror, run_rounds, sweep_emission
-from ddrecon.transport.sweep import count_directions
+from ddrecon.transport.sweep import DIRECTIONS
 
 
 @dataclass(frozen=True)
@@ -252,8 +252,7 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
     mean = mean if sky is None else mean + sky[0]
     if medium.emission is not None and not multiply_scatters(medium, settings):
-        cells = average_cells(medium)
-        directions = count_directions(medium.grid, settings.angles, 2)
+        cells, directions = average_cells(medium), DIRECTIONS[settings.angles]
         emitted, _ = sweep_emission(cells, directions, face_mirror(cells, directions))
         mean = mean + emitted[0]
     return 4 * math.pi * mean.clamp(min=0)

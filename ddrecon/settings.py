@@ -59,9 +59,8 @@ class DiffusionSettings:
     transport_tolerance: Rounds end where one changes light by less of it, at most
         `transport_rounds` of them, left out 16. `render.json` has how many there were, and their
         residual.
-    degree: Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7 (50 and
-        98 through layers that repeat along two axes); of a single round 18 for 1, 26 for 3. Left
-        out: by the medium.
+    degree: Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; of a
+        single round 18 for 1, 26 for 3. Left out: by the medium.
     refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
     refine_along: The axes along which cells are divided.
     receive: How many times narrower still cells are that receive light of suns. Left out: by the

@@ -149,7 +149,7 @@ def _round_terms(medium: Medium, scene: Scene) -> Iterator[str]:
     rounds = _count(settings.rounds, "transport round")
     if settings.transport_tolerance is not None:
         rounds += f" at most, to a residual of {settings.transport_tolerance:g},"
-    directions = count_directions(scene.volume.grid, settings.angles, settings.rounds)
+    directions = count_directions(settings.angles, settings.rounds)
     yield f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"
     if settings.times > 1:
         finer = scene.volume.grid.refine(settings.times, settings.refine_along)

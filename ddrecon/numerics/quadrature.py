@@ -6,15 +6,12 @@ doi:10.1016/0041-5553(75)90133-0, and 1976, doi:10.1016/0041-5553(76)90100-2. Th
 follows from the means of x^4 and of x^2 y^2 alone. That of 44 points is exact for the flux through
 a face as well: the mean of |x|, of which Lebedev's rules lack 11, 8, 1 and 1 percent. It has the
 means of x^4, x^2 y^2 z^2 and |x|, and those of degree 8 and 10 within 0.4 and 1.3 percent.
-Layers have rules of their own, which are exact on either side of a plane.
 """
 
 from __future__ import annotations
 
-import math
 from itertools import permutations, product
 
-from numpy.polynomial import Legendre
 from torch import Tensor
 
 _ORBITS = {
@@ -72,32 +69,4 @@ def sphere_quadrature(like: Tensor, count: int = 50) -> tuple[Tensor, Tensor]:
         }
         directions += sorted({tuple(c + 0.0 for c in point) for point in orbit})
         weights += [weight] * (len(directions) - len(weights))
-    return like.new_tensor(directions), like.new_tensor(weights)
-
-
-def layer_quadrature(
-    like: Tensor, normal: int, levels: int, azimuths: int
-) -> tuple[Tensor, Tensor]:
-    """Unit directions [N, 3] and weights [N], as of `sphere_quadrature`, for layers across an axis.
-
-    On either side of the plane across the axis `normal`, means of polynomials in the cosine to
-    degree 2 `levels` are exact, by Radau's rule: the normal itself is one of its nodes. At all
-    others lie `azimuths` directions, turned by half of their distance from level to level, which
-    integrate waves around the normal below that number. So there are 2 (`levels` `azimuths` + 1).
-    """
-    count = levels + 1
-    places = (Legendre.basis(levels) - Legendre.basis(count)).roots().real
-    places[-1] = 1.0
-    shares = (1 + places) / (2 * count * Legendre.basis(levels)(places)) ** 2
-    directions, weights = list[list[float]](), list[float]()
-    for level, (place, share) in enumerate(zip(places, shares, strict=True)):
-        around = azimuths if level < levels else 1
-        cosine = (1 + place) / 2
-        for turn, side in product(range(around), (1, -1)):
-            angle = 2 * math.pi * (turn + level % 2 / 2) / around
-            # Mirror images agree to the last digit.
-            first, second = (round(part(angle), 15) + 0.0 for part in (math.cos, math.sin))
-            direction = [math.sqrt(1 - cosine**2) * part for part in (first, second)]
-            directions.append([*direction[:normal], side * cosine, *direction[normal:]])
-            weights.append(share / around)
     return like.new_tensor(directions), like.new_tensor(weights)

@@ -25,10 +25,11 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.transport.characteristics import Characteristic
 from ddrecon.transport.mirror import Mirror
-from ddrecon.transport.sweep import count_directions, quadrature_of, sweep_change, sweep_rule
+from ddrecon.transport.sweep import count_directions, sweep_change, sweep_rule
 
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
@@ -54,8 +55,7 @@ def run_rounds(
     """
     if rounds == 0:
         return phi
-    medium = problem.medium
-    directions = count_directions(medium.grid, degree, rounds)
+    medium, directions = problem.medium, count_directions(degree, rounds)
     emitted, glow = None, face_mirror(medium, directions)
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
@@ -86,7 +86,7 @@ def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) 
     """What the faces of `medium` are to sweeps, None where they reflect nothing."""
     if medium.index == 1:
         return None
-    courses, _, values, _ = sweep_rule(medium.grid, directions, count_harmonics(medium.degree))
+    courses, _, values = sweep_rule(directions, count_harmonics(medium.degree))
     return Mirror(medium.grid, medium.index, courses, values, besides)
 
 
@@ -239,7 +239,7 @@ def _mean_step(grid: Grid, directions: int) -> tuple[float, float]:
     And the part of it by whose depth light diffuses too much, along the worst axis, because it goes
     on to several cells (E7.2). Along an axis of one cell nothing varies: such steps do not count.
     """
-    points, weights = quadrature_of(grid, directions)
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     total = weight_of_steps = 0.0
     varies = [n > 1 or axis in grid.periodic for axis, n in enumerate(grid.shape)]
     shared = [0.0, 0.0, 0.0]

@@ -20,7 +20,7 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import NEARLY, apply_around
-from ddrecon.numerics.quadrature import layer_quadrature, sphere_quadrature
+from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import constant
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
 from ddrecon.transport.mirror import Mirror
@@ -29,28 +29,11 @@ DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
 """By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
 OF_ONE_ROUND = {1: 18, 3: 26}
 """Fewer, where there is one round: what they lack is about what that has not yet brought back."""
-OF_LAYERS = {50: (3, 8), 98: (4, 12)}
-"""Levels and azimuths of so many directions through a layer, which repeats along two axes."""
-ALIKE = 1e-6
-"""Sums of harmonics whose mean square along the directions is so small are the same to these."""
 
 
-def count_directions(grid: Grid, degree: int, rounds: int) -> int:
-    """How many directions the sweeps of so many `rounds` through `grid` have."""
-    if len(grid.periodic) == 2:
-        return 98 if degree == 7 else 50
+def count_directions(degree: int, rounds: int) -> int:
+    """How many directions the sweeps of so many `rounds` have."""
     return OF_ONE_ROUND.get(degree, DIRECTIONS[degree]) if rounds == 1 else DIRECTIONS[degree]
-
-
-@functools.cache
-@torch.inference_mode(False)
-def quadrature_of(grid: Grid, directions: int) -> tuple[Tensor, Tensor]:
-    """The unit directions [N, 3] and weights [N] of so many through `grid`, in double precision."""
-    like = torch.zeros((), dtype=torch.float64)
-    if len(grid.periodic) == 2:
-        (normal,) = {0, 1, 2} - {*grid.periodic}
-        return layer_quadrature(like, normal, *OF_LAYERS[directions])
-    return sphere_quadrature(like, directions)
 
 
 def sweep(
@@ -73,10 +56,10 @@ def sweep(
         from ddrecon.transport.fused.faces import sweep_fused
 
         return sweep_fused(grid, extinction, emitted, gradient, directions, mirror)
-    courses, _, values, weighted = sweep_rule(grid, directions, count)
-    values, weighted = values.to(emitted), weighted.to(emitted)
+    courses, weights, values = sweep_rule(directions, count)
+    values = values.to(emitted)
     moments = emitted.new_zeros(count, math.prod(shape))
-    for number, direction in enumerate(courses):
+    for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
         row, ends = values[number], None if mirror is None else mirror.entering(number)
 
         def follow(
@@ -89,7 +72,7 @@ def sweep(
         radiance, gone = recompute(follow)
         if mirror is not None:
             mirror.left.append(gone)
-        moments.addr_(weighted[number], radiance.flatten())
+        moments.addr_(weight * row, radiance.flatten())
     return moments.view(count, *shape)
 
 
@@ -195,7 +178,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
 @functools.cache
 def _spread(grid: Grid, directions: int) -> tuple[list[float], list[float]]:
     """x and s of E2.16, by axis."""
-    points, weights = quadrature_of(grid, directions)
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     speed = (points / points.new_tensor(grid.spacing)).abs()
     step = 1 / speed.amax(1)
     moved = step[:, None] * speed
@@ -224,17 +207,8 @@ def cell_gradient(q: Tensor) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def sweep_rule(
-    grid: Grid, directions: int, count: int
-) -> tuple[list[Direction], list[float], Tensor, Tensor]:
-    """The directions of so many through `grid`, their weights, and `count` harmonics [N, K].
-
-    And what of the radiance along each moments have, [N, K]: weights times harmonics, and through
-    layers times the inverse of these harmonics' products (E2.18).
-    """
-    points, weights = quadrature_of(grid, directions)
+def sweep_rule(directions: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
+    """The directions of so many, weights, and the first `count` harmonics [N, K] of each."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     values = harmonics(points, math.isqrt(count - 1)).T[:, :count].contiguous()
-    weighted = weights[:, None] * values
-    if len(grid.periodic) == 2:
-        weighted = weighted @ torch.linalg.pinv(values.T @ weighted, rtol=ALIKE, hermitian=True)
-    return [(z, y, x) for z, y, x in points.tolist()], weights.tolist(), values, weighted
+    return [(z, y, x) for z, y, x in points.tolist()], weights.tolist(), values

@@ -42,7 +42,7 @@ from ddrecon.settings import RenderSettings
 from ddrecon.transport.bounced import TURNS, follow_inside
 from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.rounds import face_mirror
-from ddrecon.transport.sweep import count_directions, emitted_light, steep_gradient, sweep_rule
+from ddrecon.transport.sweep import DIRECTIONS, emitted_light, steep_gradient, sweep_rule
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """The faces of the box, in array order."""
@@ -69,8 +69,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
     as_it_is = refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)
-    directions = count_directions(medium.grid, settings.angles, 2)
-    box = _Box((medium, as_it_is), directions, lit)
+    box = _Box((medium, as_it_is), DIRECTIONS[settings.angles], lit)
     crossings = box.cross_each(scene)
     enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
@@ -269,7 +268,7 @@ class _Box:
         extinction, moments = cells.extinction.value, fill(source, medium.degree)
         moments = emitted_light(cells, cut(moments), inflow)
         gradient = torch.zeros_like(moments[:1]) if gradient is None else gradient
-        courses, weights, values, _ = sweep_rule(grid, self.directions, len(moments))
+        courses, weights, values = sweep_rule(self.directions, len(moments))
         mirror, rows = face_mirror(medium, self.directions), values.to(moments)
         begun = 0 * moments if light is None else fill(light, medium.degree)
         for sweep in range(1 if mirror is None else SWEEPS):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.quadrature import DEGREES, layer_quadrature, sphere_quadrature
+from ddrecon.numerics.quadrature import DEGREES, sphere_quadrature
 from ddrecon.numerics.series import (
     STEPS,
     angle_of,
@@ -151,22 +151,3 @@ def test_the_flux_through_a_face_is_exact_with_44_directions():
     directions, weights = RULES[44]
     flux = weights @ directions.abs()
     torch.testing.assert_close(flux, torch.full_like(flux, 0.5), rtol=1e-14, atol=0)
-
-
-@pytest.mark.parametrize(("levels", "azimuths"), [(3, 8), (4, 12)])
-@pytest.mark.parametrize("normal", range(3))
-def test_layers_are_exact_on_either_side(normal: int, levels: int, azimuths: int):
-    """Half the sphere has the mean 1/(2 l + 2) of mu^l, and none of (x + i y)^m."""
-    like = torch.zeros(1, dtype=torch.float64)
-    directions, weights = layer_quadrature(like, normal, levels, azimuths)
-    first, second = (directions[:, axis] for axis in range(3) if axis != normal)
-    around = torch.complex(first, second)
-    for side, power in product((1, -1), range(2 * levels + 1)):
-        cosine = side * directions[:, normal]
-        flux = weights * torch.where(cosine > 0, cosine**power, 0)
-        assert float(flux.sum()) == pytest.approx(1 / (2 * power + 2), abs=1e-14)
-        waves = (complex((flux * around**m).sum()) for m in range(1, azimuths))
-        assert max(map(abs, waves)) < 1e-14
-    assert len(weights) == 2 * (levels * azimuths + 1)
-    assert weights.sum().item() == pytest.approx(1, abs=1e-14) and bool((weights > 0).all())
-    torch.testing.assert_close(directions.norm(dim=1), torch.ones_like(weights), rtol=0, atol=1e-15)

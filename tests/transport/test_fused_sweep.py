@@ -130,8 +130,8 @@ CASES = {
     "empty": Case(depth=0.0),
     "island-slanted": Case((7, 8, 70), FLAT, colors=1, is_island=True),
     "island-high": Case((25, 40, 7), colors=1, moments=1, is_island=True),
-    "around-zx": Case((3, 4, 5), periodic=(0, 2), directions=50, moments=36),
-    "around-cubes": Case(periodic=(0, 1), spacing=CUBES, directions=50, colors=1, varies=True),
+    "around-zx": Case((3, 4, 5), periodic=(0, 2)),
+    "around-cubes": Case(periodic=(0, 1), spacing=CUBES, colors=1, varies=True),
     "refracting": Case(index=1.4, known=4),
 }
 

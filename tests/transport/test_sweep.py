@@ -22,13 +22,7 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.transport.characteristics import Characteristic, Direction, Ends
 from ddrecon.transport.characteristics import radiance_along as follow
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds
-from ddrecon.transport.sweep import (
-    cell_gradient,
-    emitted_light,
-    steep_gradient,
-    sweep,
-    sweep_rule,
-)
+from ddrecon.transport.sweep import cell_gradient, emitted_light, steep_gradient, sweep
 
 Cell = tuple[int, int, int]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
@@ -367,15 +361,3 @@ def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int
     assert torch.autograd.gradcheck(
         radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True
     )
-
-
-@pytest.mark.parametrize(("directions", "count"), [(50, 36), (98, 64)])
-def test_moments_through_layers_tell_all_harmonics_apart_and_keep_energy(
-    directions: int, count: int
-):
-    """E2.18; the mean of light is the quadrature's, whatever light is."""
-    grid = Grid((2, 2, 2), (0.0,) * 3, (1.0,) * 3, periodic=(1, 2))
-    _, weights, values, weighted = sweep_rule(grid, directions, count)
-    unit = torch.eye(count, dtype=torch.float64)
-    torch.testing.assert_close(weighted.T @ values, unit, rtol=0, atol=1e-12)
-    torch.testing.assert_close(weighted[:, 0], values.new_tensor(weights), rtol=0, atol=1e-14)

@@ -35,7 +35,7 @@ def sweep_fused(
     if not (emitted.is_cuda or grid.periodic or mirror):
         return sweep_ordinates((grid, directions, None), fields)[0]
     tables = ordinate_tables(grid, directions, emitted, len(emitted))
-    points, *_ = sweep_rule(grid, directions, 1)
+    points, *_ = sweep_rule(directions, 1)
     moments, gone = torch.zeros_like(emitted), dict[int, Ends]()
     # Light of a single chunk is kept for the way back; of several, one at a time is there.
     run = _sweep_chunk if len(tables.chunks) == 1 else functools.partial(recompute, _sweep_chunk)

@@ -173,7 +173,7 @@ def _make_tables(
     device: torch.device,
 ) -> Tables:
     """The same, of chunks of about so many teams `together`."""
-    points, _, harmonics, weighted = sweep_rule(grid, directions, moments)
+    points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
     if pieces is None:
         # Those that go around are followed again and again: they are in chunks of their own.
@@ -193,12 +193,13 @@ def _make_tables(
         chunks.append(Chunk(first, len(order) - first, len(rows) - len(several), len(several)))
     numbers = [o.number for o in order]
     paths = torch.tensor([o.numbers() for o in order], dtype=torch.float64)
+    values, set_weights = harmonics[numbers], harmonics.new_tensor(weights)[numbers, None]
     integers = {"teams": rows, "ordinates": [o.integers(grid.shape[2]) for o in order]}
     tables = {
         "paths": paths,
         "moved": paths[:, 1:4],
-        "values": paths[:, :1] * harmonics[numbers],
-        "weighted": weighted[numbers],
+        "values": paths[:, :1] * values,
+        "weighted": set_weights * values,
     }
     arrays = {
         name: torch.tensor(table, dtype=torch.int32, device=device)
