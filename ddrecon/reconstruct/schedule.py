@@ -95,7 +95,10 @@ class Schedule:
         """
         progress, is_last = self.progress, self.progress.stage == len(self.stages) - 1
         share = (self.most - progress.began) // 2
-        is_short = not is_last and iteration - progress.began >= max(share, 1)
+        # What goes on alike, with its metric taken anew, does so from rest alone.
+        is_alike = not is_last and self.stages[progress.stage + 1] == self.stage
+        is_due = iteration - progress.began >= max(share, 1)
+        is_short = is_due and not (is_last or is_alike)
         is_at_rest = search.gain < tuning.REST
         # A finer level begins with the bulk: from there a light prior lets it fit noise alone.
         is_light = search.weight * search.objective.prior < tuning.LIGHT * search.objective.loss
