@@ -37,7 +37,7 @@ def find_diagonals(
     root mean square.
     """
     names = [view.name for view in scene.views]
-    generators = {n: torch.Generator().manual_seed(at) for at, n in enumerate(names)}
+    generators = {n: torch.Generator().manual_seed(at) for at, n in enumerate(sorted(names))}
 
     def along(view: View, image: Tensor) -> Tensor:
         signs = torch.randint(0, 2, image.shape, generator=generators[view.name]) * 2 - 1

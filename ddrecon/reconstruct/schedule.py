@@ -97,7 +97,7 @@ class Schedule:
         share = (self.most - progress.began) // 2
         # What goes on alike, with its metric taken anew, does so from rest alone.
         is_alike = not is_last and self.stages[progress.stage + 1] == self.stage
-        is_due = iteration - progress.began >= max(share, 1)
+        is_due = search.moves > 0 and iteration - progress.began >= share
         is_short = is_due and not (is_last or is_alike)
         is_at_rest = search.gain < tuning.REST
         # A finer level begins with the bulk: from there a light prior lets it fit noise alone.

@@ -70,7 +70,7 @@ class Search:
     `move`. As far as derivatives tell, the loss falls by `slope` along that direction and by
     `promise` in that move; `is_stuck` where no step helps. `scales` are how long the metric is, by
     group of values, as the last pair had it. `gains` are what the loss could still fall by, as part
-    of it, at the last values.
+    of it, at the last values. `moves`: how many candidates were accepted after the first.
     """
 
     space: Space
@@ -87,6 +87,7 @@ class Search:
     scales: dict[str, float] = field(default_factory=dict)
     gains: list[float] = field(default_factory=list)
     is_stuck: bool = False
+    moves: int = 0
 
     @property
     def gain(self) -> float:
@@ -120,6 +121,7 @@ class Search:
                 _combine(objective.prior_gradients, old.prior_gradients, -1),
             )
             self.pairs = [*self.pairs, (self.move, *changes)][-tuning.PAIRS :]
+            self.moves += 1
         self.values, self.objective = values, objective
         self.aim()
         return True

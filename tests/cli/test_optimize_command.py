@@ -295,11 +295,11 @@ def test_more_iterations_go_on_from_the_end(succeed: Run, monkeypatch: pytest.Mo
     """At the resolution that was reached, and by the folder's own scene as well."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
     command = [*OPTIMIZE, "out", *FINER, "--iterations"]
-    succeed(*command, "2")
+    succeed(*command, "4")
     first, reached = Path("out/loss.csv").read_text(), column("out", "cells")[-1]
     assert reached == 16 * 8 * 8
-    succeed(*command, "4", "--resume")
-    succeed("optimize", "out/scene.yaml", "-q", "--iterations", "5", "-o", "out", "--resume")
-    assert column("out", "iteration") == [1, 2, 3, 4, 5]
-    assert set(column("out", "cells")[2:]) == {reached}
+    succeed(*command, "6", "--resume")
+    succeed("optimize", "out/scene.yaml", "-q", "--iterations", "7", "-o", "out", "--resume")
+    assert column("out", "iteration") == [*range(1, 8)]
+    assert set(column("out", "cells")[4:]) == {reached}
     assert Path("out/loss.csv").read_text().startswith(first)

@@ -24,7 +24,9 @@ class FakeSearch(SimpleNamespace):
     """A search whose loss of images is `loss`, with a prior, and that can still gain `gain`."""
 
     def __init__(self, loss: float, gain: float, prior: float = 1.0):
-        super().__init__(gain=gain, weight=1.0, objective=SimpleNamespace(loss=loss, prior=prior))
+        super().__init__(
+            gain=gain, moves=1, weight=1.0, objective=SimpleNamespace(loss=loss, prior=prior)
+        )
 
     def reweigh(self, weight: float) -> None:
         self.weight = weight
@@ -140,3 +142,14 @@ def test_noise_is_not_fitted_on_refined_grids_where_the_prior_is_light(
         schedule.note(len(made), FakeSearch(1.0, gain, prior), 1.0)
     assert made == levels
     assert schedule.ending(len(made))["kind"] == ("noise" if prior < 0.5 else "iterations")
+
+
+def test_no_stage_ends_before_something_has_moved() -> None:
+    """Runs of few iterations came to nothing: each stage looked where it began, and was over."""
+    schedule, search = Schedule(3, STAGES), FakeSearch(1.0, 1.1 * REST)
+    search.moves = 0
+    schedule.note(1, search, 0.0)
+    assert schedule.progress.stage == 0
+    search.moves = 1
+    schedule.note(2, search, 0.0)
+    assert schedule.progress.stage == 1
