@@ -125,9 +125,9 @@ def print_layers(layers: dict[str, Layer | StepCloud]) -> None:
         errors = dict[str, dict[str, float]]()
         for model in ("default", *MODELS):  # the first is measured when kernels are there
             start = time.perf_counter()
-            found = layer.seen([*MODELS[model]])
+            seen = layer.seen([*MODELS[model]])
             seconds[model] = time.perf_counter() - start
-            errors[model] = {key: percent_off(found[key], wanted) for key, wanted in truth.items()}
+            errors[model] = {key: percent_off(seen[key], wanted) for key, wanted in truth.items()}
         forms = {key: "+.1f" if np.ndim(wanted) == 0 else ".1f" for key, wanted in truth.items()}
         shown = (
             ", ".join(f"{key} {off:{forms[key]}}" for key, off in errors[model].items())

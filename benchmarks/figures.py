@@ -142,8 +142,8 @@ def ask_git(*words: str) -> str:
 
 def print_row(*cells: object) -> None:
     """Prints a row of a table."""
-    shown = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
-    print(f"| {' | '.join(shown)} |", flush=True)
+    texts = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
+    print(f"| {' | '.join(texts)} |", flush=True)
 
 
 def print_header(*names: str) -> None:

@@ -146,11 +146,11 @@ def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tup
     path = str(write_scene(folder, cells, pixels, title, verb == "optimize"))
     program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
     check = [*program, "check", path, "--json"]
-    told = subprocess.run(check, capture_output=True, text=True, check=True).stdout
+    report = subprocess.run(check, capture_output=True, text=True, check=True).stdout
     command = [*program, verb, path, "-o", str(folder / verb), "--overwrite", "-q"]
     if verb == "solve":
         command = [sys.executable, "-c", SOLVE, path]
-    return peak(command), int(json.loads(told)["memory_bytes"])
+    return peak(command), int(json.loads(report)["memory_bytes"])
 
 
 def main() -> None:
@@ -158,10 +158,10 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
     parser.add_argument("--count", action="store_true")
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if given.count:
+        if options.count:
             print_header("scene", "render", "iteration", "at its peak")
             count(folder, 48, "gray")  # what is made once for a grid does not count
             for title in CASES:
@@ -174,14 +174,14 @@ def main() -> None:
             verbs = ("solve", "render", "optimize")
             bases = {verb: measure(folder, verb, SMALL, 16, title)[0] for verb in verbs}
             colors = 3 if {"albedo", "sigma_a"} & {*medium} else 1
-            for cells in given.cells:
+            for cells in options.cells:
                 solve = measure(folder, "solve", cells, 16, title)[0] - bases["solve"]
                 number = solve / (cells**3 - SMALL**3) / colors
                 for verb in verbs[1:]:
                     taken, predicted = measure(folder, verb, cells, 256, title)
                     used = taken - bases[verb]
-                    parts = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
-                    print_row(title, f"{cells}^3", f"{number:.0f}", verb, *parts)
+                    figures = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
+                    print_row(title, f"{cells}^3", f"{number:.0f}", verb, *figures)
 
 
 if __name__ == "__main__":

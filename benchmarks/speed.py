@@ -195,8 +195,8 @@ def print_scale() -> None:
         halves = 0, min(len(amounts) // 2, len(amounts) - 2)
         exponents = (np.polyfit(*(column[half:] for column in logs), 1)[0] for half in halves)
         pairs = zip(amounts, times, strict=True)
-        shown = ", ".join(f"{amount}: {taken:.3f}" for amount, taken in pairs)
-        print_row(name, shown, *(f"{exponent:.2f}" for exponent in exponents))
+        steps = ", ".join(f"{amount}: {taken:.3f}" for amount, taken in pairs)
+        print_row(name, steps, *(f"{exponent:.2f}" for exponent in exponents))
 
 
 def load_case(views: int, *overrides: str) -> Scene:
@@ -283,9 +283,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("stage", choices=STAGES)
     parser.add_argument("--threads", type=int, default=2)
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
-    STAGES[given.stage]()
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    STAGES[options.stage]()
 
 
 if __name__ == "__main__":

@@ -139,12 +139,12 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="only these volumes")
     parser.add_argument("--references", type=Path)
     parser.add_argument("--calibrate", type=int, default=2)
-    given, is_first = parser.parse_args(), True
+    options, is_first = parser.parse_args(), True
     use_engine("auto")
     torch.manual_seed(0)
-    for name, case in known_cases(given.references).items():
-        if not given.names or name in given.names:
-            row = {"volume": name} | judge(case(), given.calibrate)
+    for name, case in known_cases(options.references).items():
+        if not options.names or name in options.names:
+            row = {"volume": name} | judge(case(), options.calibrate)
             if is_first:
                 print_header(*row)
             print_row(*row.values())

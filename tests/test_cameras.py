@@ -175,9 +175,9 @@ def plainly(model: str, k: list[float], x: float, y: float, z: float) -> tuple[f
 @pytest.mark.parametrize("model", LENSES)
 def test_a_direction_meets_the_image_where_the_manual_says(model: str) -> None:
     rays = [(0.0, 0.0, 1.0), (0.3, -0.2, 1.0), (-0.5, 0.4, 1.2), (0.01, 0.6, 0.9)]
-    found = distort(model, lens_of(model), torch.tensor(rays, dtype=torch.float64))
+    distorted = distort(model, lens_of(model), torch.tensor(rays, dtype=torch.float64))
     expected = [plainly(model, LENSES[model], *ray) for ray in rays]
-    torch.testing.assert_close(found, torch.tensor(expected).to(found), rtol=0, atol=1e-7)
+    torch.testing.assert_close(distorted, torch.tensor(expected).to(distorted), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -214,8 +214,8 @@ def test_rays_of_pixels(model: str) -> None:
     right, up, backward = camera.pose[:, :3].unbind(1)
     direction = cast_rays(camera).direction.flip(1)
     ray = torch.stack([direction @ right, -direction @ up, -direction @ backward], 1)
-    found = distort(model, lens_of(model), ray)
-    torch.testing.assert_close(found, image_places(camera), rtol=0, atol=1e-14)
+    distorted = distort(model, lens_of(model), ray)
+    torch.testing.assert_close(distorted, image_places(camera), rtol=0, atol=1e-14)
     coarse = cast_rays(camera.resize(2), (0.0, 0.0)).direction[19]
     torch.testing.assert_close(coarse, cast_rays(camera, (0.0, 0.0)).direction[36 * 2 + 2])
 

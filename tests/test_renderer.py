@@ -215,6 +215,6 @@ def test_a_picture_is_exposure_times_radiance_and_offset_and_what_shows_through(
     dark, bright = picture(background=zero), picture(background=zero + 1)
     transmittance = bright - dark
     assert 0 < float(transmittance.min()) < float(transmittance.max()) <= 1 + 1e-12
-    shown = picture(background=zero + 0.4, exposure=tensor(1.7), offset=tensor(0.05))
+    actual = picture(background=zero + 0.4, exposure=tensor(1.7), offset=tensor(0.05))
     expected = 1.7 * dark + transmittance * (0.4 - 0.05) + 0.05
-    torch.testing.assert_close(shown, expected, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(actual, expected, rtol=1e-6, atol=1e-6)

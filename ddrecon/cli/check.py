@@ -21,7 +21,7 @@ from ddrecon.reconstruct.support import (
     find_support,
     support_text,
 )
-from ddrecon.run.job import Told
+from ddrecon.run.job import Outcome
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
@@ -63,7 +63,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
     return supports
 
 
-def describe(scene: Scene, supports: Sequence[Support] = ()) -> Told:
+def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
     """Tells of `scene` its grid, physics, engine, time and so on, and what can hardly be meant.
 
     Its parameters are where they start.
@@ -126,7 +126,7 @@ def _describe_views(scene: Scene) -> tuple[list[dict[str, Any]], list[str]]:
     views, lines = list[dict[str, Any]](), list[str]()
     for view in scene.views:
         camera = view.camera
-        told = {
+        row = {
             "name": view.name,
             "camera": "perspective" if camera.is_perspective else "orthographic",
             "width": camera.size[1],
@@ -135,9 +135,9 @@ def _describe_views(scene: Scene) -> tuple[list[dict[str, Any]], list[str]]:
             "has_image": view.image is not None,
             "cell": cell_width(scene.volume.grid, camera),
         }
-        views.append(told)
-        text = "  {name}: {camera}, {width} x {height} pixels, {split}".format(**told)
-        lines.append(text + (", with image" if told["has_image"] else ""))
+        views.append(row)
+        text = "  {name}: {camera}, {width} x {height} pixels, {split}".format(**row)
+        lines.append(text + (", with image" if row["has_image"] else ""))
     return views, lines
 
 

@@ -188,8 +188,8 @@ def _run(function: Callable[..., None], is_shared: bool, values: dict[str, Any])
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = {field.name for field in fields(Session)} & values.keys()
-    said = {name: values.pop(name) for name in common}
-    session = Session(**{name: value for name, value in said.items() if value is not None})
+    options = {name: values.pop(name) for name in common}
+    session = Session(**{name: value for name, value in options.items() if value is not None})
     be_quiet(session.quiet)
     with show_warnings():
         if session.report is not None:

@@ -20,7 +20,7 @@ from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
-    from ddrecon.run.job import Told
+    from ddrecon.run.job import Outcome
     from ddrecon.scene_file.load import SceneFile
 
 
@@ -96,16 +96,16 @@ def render(
         raise click.UsageError("--movie is of one frame: name it, such as FILM/frames/0003")
     from ddrecon.film.drive import finished_frames
 
-    told: dict[str, Told] = {}
+    outcomes: dict[str, Outcome] = {}
     with session.claim(RENDER) as folder:
         runs = finished_frames(source, frames)
         if folder is not None and frames is None:
             folder.clear()
         for run in runs:
             of_frame = replace(session, output=session.output / run.name)
-            told[run.name] = _render(of_frame, run, is_bare, size, choice)
-    records = {name: record for name, (record, _) in told.items()}
-    session.show(records, [line for _, lines in told.values() for line in lines])
+            outcomes[run.name] = _render(of_frame, run, is_bare, size, choice)
+    records = {name: record for name, (record, _) in outcomes.items()}
+    session.show(records, [line for _, lines in outcomes.values() for line in lines])
 
 
 def _render(
@@ -114,7 +114,7 @@ def _render(
     is_bare: bool,
     size: tuple[int, int] | None,
     choice: dict[str, Any],
-) -> Told:
+) -> Outcome:
     """Renders one scene, without its pictures where it `is_bare`."""
     scene_file = session.read(source)
     from ddrecon.io.files.folders import RENDER, require_free_files
@@ -183,8 +183,8 @@ def optimize(
                 name_kernels(torch.empty(0, dtype=dtype, device=place))
             scene, environment = session.build(scene_file), session.environment()
         job = Run(scene, scene_file, environment, preview_every)
-        told = work(job, folder, session.resume)
-    session.show(*told)
+        outcome = work(job, folder, session.resume)
+    session.show(*outcome)
 
 
 def _optimize_film(
@@ -195,7 +195,7 @@ def _optimize_film(
     shared: Path | None,
     exported: str | None,
     up: str | None,
-) -> Told:
+) -> Outcome:
     """Reconstructs the frames of a film that are this rank's."""
     from ddrecon.film.drive import Film, choose_frames, open_film, share_out
     from ddrecon.film.report import drive_film
@@ -230,5 +230,5 @@ def uncertainty(session: Session, source: Path, experiments: int) -> None:
         )
     job = Uncertainty(run, session.seed, experiments)
     with session.claim(UNCERTAINTY) as folder:
-        told = work(job, folder, session.resume)
-    session.show(*told)
+        outcome = work(job, folder, session.resume)
+    session.show(*outcome)

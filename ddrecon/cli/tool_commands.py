@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from ddrecon.cli.session import Session
     from ddrecon.io.volumes.field import Facts, Fields
-    from ddrecon.run.job import Told
+    from ddrecon.run.job import Outcome
     from ddrecon.scene import Scene
 
 
@@ -56,9 +56,9 @@ def reference(
     tracer = open_tracer(scene, views, threads=session.threads)
     with claim_folder(output, REFERENCE, overwrite=session.overwrite) as folder:
         folder.clear([source, *referenced_files(scene_file)])
-        shown = None if is_only_traced else scene
+        compared = None if is_only_traced else scene
         settings = output, paths, session.seed, session.progress
-        report = compare_to_folder(tracer, shown, views, *settings)
+        report = compare_to_folder(tracer, compared, views, *settings)
         report["environment"] = session.environment() | {"mitsuba": tracer.module.__version__}
         write_json(output / "reference.json", report)
     session.show(report, reference_lines(report))
@@ -96,7 +96,7 @@ def bench(session: Session, source: Path | None, is_quick: bool, is_hard: bool) 
 
 def _bench_speed(
     session: Session, load: Callable[[torch.dtype], Scene] | None, is_quick: bool
-) -> Told:
+) -> Outcome:
     from ddrecon.bench import bench_lines, load_pair, run_bench
     from ddrecon.errors import MissingExtraError, SceneError
     from ddrecon.reference.trace import open_tracer

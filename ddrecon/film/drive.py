@@ -44,7 +44,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.job import (
     CHECKPOINTS,
     PREVIOUS,
-    Told,
+    Outcome,
     fingerprint,
     has_checkpoint,
     require_same,
@@ -223,7 +223,7 @@ class Calibration(Iterations):
     def begin(self, folder: Folder, is_resumed: bool) -> None:
         """Nothing is to be made, nor to go."""
 
-    def finish(self) -> Told:
+    def finish(self) -> Outcome:
         """Writes the volumes of these frames and what they share; its checkpoints go."""
         film, together = self.film, self.run
         scene, names = together.current_scene(), [p.name for p in together.shared]
@@ -299,11 +299,11 @@ def open_film(
             require_same(old, new, f"{path}: holds another film; use another output folder")
         write_scene(scene_file, path)
         if not resume:
-            begun = [f"frames/{number:04d}/" for number in chosen]
-            begun += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
+            folders = [f"frames/{number:04d}/" for number in chosen]
+            folders += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
             inputs = [old_scene, scene_file.path, *referenced_files(scene_file)]
             inputs += [] if shared is None else [shared]
-            folder.clear(inputs, begun if is_same else [""])
+            folder.clear(inputs, folders if is_same else [""])
         if calibration is not None:
             file = path / SHARED
             if file.is_file() and read_shared(file)["values"] != calibration["values"]:

@@ -17,7 +17,7 @@ from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import pixels, shrink
-from ddrecon.run.job import Told
+from ddrecon.run.job import Outcome
 from ddrecon.run.report import describe_fields, psnr_text
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import REPORT, SUMMARY
@@ -37,7 +37,7 @@ REPORT_SHARE = 0.05
 
 def drive_film(
     film: Film, numbers: Sequence[int], exported: str | None, up: str | None = None
-) -> Told:
+) -> Outcome:
     """Tells of `film` after its frames `numbers`, those that are not yet done.
 
     All that are done then are `exported` as volumes of this kind, in which the axis `up` points up.
@@ -51,21 +51,20 @@ def drive_film(
                 _report(film)
                 due = monotonic() + (monotonic() - start) / REPORT_SHARE
     finally:
-        told = _report(film)
+        outcome = _report(film)
     if exported is not None:
         with film.claim(film.path, FILM):
             export_film(film, exported, up)
-    return told
+    return outcome
 
 
-def _report(film: Film) -> Told:
-    with film.claim(
-        film.path, FILM
-    ):  # the last of several parts to come knows of all that are done
+def _report(film: Film) -> Outcome:
+    # The last of several parts to come knows of all that are done.
+    with film.claim(film.path, FILM):
         return write_film_report(film)
 
 
-def write_film_report(film: Film) -> Told:
+def write_film_report(film: Film) -> Outcome:
     """Tells of the frames of `film` that are done; writes the record, `film.json`, and a page."""
     rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
     for number in film.done():
@@ -131,9 +130,9 @@ def _figures(
 ) -> list[list[tuple[bytes, str]]]:
     """Pictures of the views held out, or of the first one, in the frames `numbers`."""
     views = next(iter(summaries.values()))["views"]
-    shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
-    strips: list[list[tuple[bytes, str]]] = [[] for _ in shown]
-    for name, strip in zip(shown, strips, strict=True):
+    names = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
+    strips: list[list[tuple[bytes, str]]] = [[] for _ in names]
+    for name, strip in zip(names, strips, strict=True):
         for number in numbers:
             stored = read_image(film.of(number) / "previews" / f"{name}.png").pixels
             image = shrink(torch.from_numpy(stored).permute(2, 0, 1), WIDEST)

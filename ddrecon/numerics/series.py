@@ -209,7 +209,7 @@ def at_even_angles(angles: np.ndarray, values: np.ndarray) -> np.ndarray:
     inner = sum(weights) / (weights[0] / low + weights[1] / high)
     slopes = np.pad(np.where(is_monotone, inner, 0), ((0, 0), (1, 1)))
     places = np.linspace(0, math.pi, STEPS + 1)
-    left = np.searchsorted(angles, places, side="right").clip(1, len(angles) - 1) - 1
-    entries = values[:, left], slopes[:, left], values[:, left + 1], slopes[:, left + 1]
-    cubic = _cubic((places - angles[left]) / widths[left], widths[left])
+    node = np.searchsorted(angles, places, side="right").clip(1, len(angles) - 1) - 1
+    entries = values[:, node], slopes[:, node], values[:, node + 1], slopes[:, node + 1]
+    cubic = _cubic((places - angles[node]) / widths[node], widths[node])
     return np.sum([weight * entry for weight, entry in zip(cubic, entries, strict=True)], axis=0)

@@ -153,8 +153,8 @@ def _evaluate(module: ModuleType, volume: Any, grid: Any, bounds: np.ndarray) ->
     """`volume` at the centers of the cells of `grid`, whose box `bounds` is."""
     cells = [int(count) for count in grid.resolution()]
     check_size(12 * math.prod(cells), Path("sigma_t"), "the volume")
-    parts = np.indices(cells[::-1])[::-1].reshape(3, -1).T + 0.5
-    points = bounds[0] + parts / cells * (bounds[1] - bounds[0])
+    places = np.indices(cells[::-1])[::-1].reshape(3, -1).T + 0.5
+    points = bounds[0] + places / cells * (bounds[1] - bounds[0])
     inside, values = module.Interaction3f(), np.empty(points.shape, np.float32)
     for cell, point in enumerate(points.tolist()):
         inside.p = point

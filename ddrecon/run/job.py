@@ -42,7 +42,7 @@ UNUSABLE = f"not a usable checkpoint; {ANEW}"
 MOST_CHANGES, LONGEST_VALUE = 5, 80
 """Differences that are named, and characters of a value that are shown."""
 ABSENT = object()
-Told = tuple[dict[str, Any], list[str]]
+Outcome = tuple[dict[str, Any], list[str]]
 """What a command has to tell: a record, of plain values by key, and the same as lines."""
 
 
@@ -81,11 +81,11 @@ class Job(Protocol):
         if not is_resumed:
             folder.clear()
 
-    def finish(self) -> Told:
+    def finish(self) -> Outcome:
         """Writes what was found to the folder, and tells it."""
 
 
-def work(job: Job, folder: Folder | None, is_resumed: bool) -> Told:
+def work(job: Job, folder: Folder | None, is_resumed: bool) -> Outcome:
     """What `job` tells after the iterations that are left, from what its `folder` has on.
 
     A rank whose folder is None does its part, writes nothing and has nothing to tell. Raises

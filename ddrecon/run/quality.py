@@ -80,24 +80,24 @@ def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
     scene, sizes = run.current_scene(), response_sizes(run.parameters)
     images, quality = dict[str, Tensor](), dict[str, dict[str, Any]]()
     findings = Findings(scene, _find_truths(run.problem.scene), images, quality)
-    shown = replace(scene, views=findings.seen)
-    targets = targets_of(shown, run.problem.loss, run.problem.noises)
+    compared = replace(scene, views=findings.seen)
+    targets = targets_of(compared, run.problem.loss, run.problem.noises)
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
-        for view in show_progress(shown.views, "register") if is_last else shown.views:
+        for view in show_progress(compared.views, "register") if is_last else compared.views:
             target, fitted = targets[view.name], dict[str, Tensor]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
                 picture, fitted = fit_held_out(picture, view, target, sizes)
             images[view.name] = picture
-            told = quality[view.name] = {
+            row = quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
             if is_last and view.is_test:
-                told["registered"] = register(light_field, scene, view, target, sizes)
+                row["registered"] = register(light_field, scene, view, target, sizes)
     return findings
 
 
@@ -308,5 +308,5 @@ def explain(view: View, residual: Tensor, slopes: Tensor) -> tuple[list[float], 
     if total == 0 or float(torch.linalg.det(normal)) <= 1e-9 * float(normal.trace()) ** count:
         return [0.0] * count, 0.0
     factors = torch.linalg.solve(normal, slopes @ residual)
-    left = residual - factors @ slopes
-    return factors.tolist(), 1 - float(left @ left) / total
+    unexplained = residual - factors @ slopes
+    return factors.tolist(), 1 - float(unexplained @ unexplained) / total

@@ -36,7 +36,7 @@ from ddrecon.pictures import srgb
 from ddrecon.progress import show_progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
-from ddrecon.run.job import Told
+from ddrecon.run.job import Outcome
 from ddrecon.run.run_folder import write_volume
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
@@ -121,7 +121,7 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
         load_for_file("imageio_ffmpeg", path)
 
 
-def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: Choice) -> Told:
+def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: Choice) -> Outcome:
     """Renders `views` of `scene` to `folder`, with `render.json`; the first rank alone tells."""
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
@@ -237,9 +237,9 @@ def _write_slopes(stem: Path, slopes: Mapping[str, Tensor], scales: dict[str, fl
     """As `_write_images`, of derivatives, if any; the values of full red are added to `scales`."""
     if not slopes:
         return []
-    shown = {name: diverging(slope) for name, slope in slopes.items()}
-    scales |= {stem.name + name: full for name, (_, full) in shown.items()}
-    return _write_images(stem, slopes, {name: preview for name, (preview, _) in shown.items()})
+    diverged = {name: diverging(slope) for name, slope in slopes.items()}
+    scales |= {stem.name + name: full for name, (_, full) in diverged.items()}
+    return _write_images(stem, slopes, {name: preview for name, (preview, _) in diverged.items()})
 
 
 def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> float:

@@ -181,9 +181,9 @@ def _describe_views(findings: Findings) -> dict[str, Any]:
     for view in findings.scene.views:
         height, width = view.camera.size
         quality = findings.quality.get(view.name)
-        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        scores = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
         split = "test" if view.is_test else "train"
-        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *scores))
     return {
         "white": f"{white:.3g}",
         "groups": [(label, figures) for label, figures in groups.items() if figures],

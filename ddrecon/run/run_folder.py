@@ -27,7 +27,7 @@ from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.job import CHECKPOINTS, Job, Told, fingerprint, load_checkpoint, restore
+from ddrecon.run.job import CHECKPOINTS, Job, Outcome, fingerprint, load_checkpoint, restore
 from ddrecon.run.quality import Findings, describe_loss, diagnose, find_results, loss_text
 from ddrecon.run.report import FINER, GOES_ON, list_numbers, psnr_text, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
@@ -160,7 +160,7 @@ class Run(Iterations):
             flush(self.path / LOG)
         return super().state()
 
-    def finish(self) -> Told:
+    def finish(self) -> Outcome:
         """Writes volumes, parameters, result, pictures and report, and tells the summary."""
         assert self.path is not None
         run, path = self.run, self.path
@@ -261,8 +261,8 @@ def write_previews(folder: Path, findings: Findings, mark: str) -> None:
         write_preview(folder / "previews" / f"{name}.slices{mark}.png", slices(value))
     for view in findings.seen:
         assert view.image is not None
-        shown = comparison(view.image, findings.images[view.name])
-        write_preview(folder / "previews" / f"{view.name}{mark}.png", shown)
+        beside = comparison(view.image, findings.images[view.name])
+        write_preview(folder / "previews" / f"{view.name}{mark}.png", beside)
 
 
 def write_scene(scene_file: SceneFile, folder: Path) -> None:

@@ -32,7 +32,7 @@ from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.report.page import write_page
-from ddrecon.run.job import Job, Told
+from ddrecon.run.job import Job, Outcome
 from ddrecon.run.report import describe_fields
 from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene
@@ -188,7 +188,7 @@ class Uncertainty(Job):
                 numbers[name] = _with_deviation(value, torch.cat(errors))
         return numbers
 
-    def finish(self) -> Told:
+    def finish(self) -> Outcome:
         """Writes deviations, as volumes and as a page, and tells `uncertainty.json`."""
         fields, numbers, path = self.fields(), self.numbers(), self.path
         (path / "volumes").mkdir(exist_ok=True)
@@ -214,12 +214,12 @@ class Uncertainty(Job):
         lines = [_field_text(name, field) for name, field in record["fields"].items()]
         rows = [(n, f"{x['value']:.5g} +- {x['deviation']:.2g}") for n, x in numbers.items()]
         scene = self.run.current_scene()
-        shown = {
+        volumes = {
             f"deviation of {n}": f.deviation for n, f in fields.items() if kind_of(n).is_cellwise
         }
-        first = next(iter(shown), "density")
-        shown = {name: value.cpu() for name, value in fields_of(scene).items()} | shown
-        cells = [(name, "result", value, None) for name, value in shown.items()]
+        first = next(iter(volumes), "density")
+        volumes = {name: value.cpu() for name, value in fields_of(scene).items()} | volumes
+        cells = [(name, "result", value, None) for name, value in volumes.items()]
         write_page(
             path / "report.html",
             title=f"ddrecon: how sure a run is ({path.absolute().name})",

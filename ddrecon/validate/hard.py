@@ -93,7 +93,7 @@ class HardCase:
         z, y, x = (side / 2 for side in self.sides)
         grid = Grid(self.shape, (-z, -y, -x), (z, y, x))
         sigma_t = self.depth / min(grid.spacing)
-        sigma_a, sigma_s = (tensor([sigma_t * part]) for part in (1 - self.albedo, self.albedo))
+        sigma_a, sigma_s = (tensor([sigma_t * share]) for share in (1 - self.albedo, self.albedo))
         density = self.density(self.shape).to(device, dtype)
         volume = Volume(grid, density, sigma_a, sigma_s, HenyeyGreenstein(tensor(self.g)))
         lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([3.0]))]

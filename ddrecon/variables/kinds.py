@@ -94,9 +94,11 @@ def unit_of(scene: Scene, name: str) -> float:
     """
     volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
     if kind == "emission":
-        shown = [view.seen for view in scene.views if view.image is not None and not view.is_test]
-        total = sum(float(image.mean()) for image in shown)
-        squares = sum(float(image.square().mean()) for image in shown)
+        pictures = [
+            view.seen for view in scene.views if view.image is not None and not view.is_test
+        ]
+        total = sum(float(image.mean()) for image in pictures)
+        squares = sum(float(image.square().mean()) for image in pictures)
         return (squares / total if total > 0 else 1.0) / side
     if kind != "density" and not kind.startswith("sigma_"):
         return 1.0
@@ -149,7 +151,8 @@ class Kind:
     @property
     def limits(self) -> str:
         """Within what values are kept, in words."""
-        return f"at least {self.low:g} and at most {self.high:g}"
+        most = "" if self.high == math.inf else f" and at most {self.high:g}"
+        return f"at least {self.low:g}{most}"
 
     def allows(self, values: Tensor) -> bool:
         """Whether all `values` are within the limits."""

@@ -140,8 +140,8 @@ def test_an_engine_that_cannot_be_is_refused(
 ) -> None:
     monkeypatch.setattr(engine, "find_spec", {}.get)
     command = "check", "scene.yaml", "--engine"
-    told = succeed(*command, "auto").stderr, succeed(*command, "torch").stderr
-    assert ['pip install "ddrecon[fast]"' in text for text in told] == [True, False]
+    texts = succeed(*command, "auto").stderr, succeed(*command, "torch").stderr
+    assert ['pip install "ddrecon[fast]"' in text for text in texts] == [True, False]
     command = "optimize", "scene.yaml", "-o", "out", "--engine"
     (line,) = refuse(3, *command, "warp")
     assert line.startswith("engine warp needs warp: pip install")

@@ -162,13 +162,13 @@ def test_what_is_no_field_of_the_same_cells_is_named(succeed: Run, refuse: Refus
     """And left out of an export, with a warning; a file of nothing else is refused."""
     others = {"origin": np.zeros(3), "finer": np.ones((4, 4, 4))}
     np.savez("all.npz", density=np.ones((2, 2, 2)), bounds=BOUNDS, **others)
-    cells, density, *told = succeed("info", "all.npz").stdout.splitlines()
+    cells, density, *lines = succeed("info", "all.npz").stdout.splitlines()
     assert cells.startswith("cells: 2 x 2 x 2") and density.startswith("density: gray, 1 to 1")
     starts = [
         f"no field: {name} {why}"
         for name, why in zip(others, ("has shape [3]", "has 4 x 4"), strict=True)
     ]
-    assert all(line.startswith(start) for line, start in zip(told, starts, strict=True))
+    assert all(line.startswith(start) for line, start in zip(lines, starts, strict=True))
     said = json.loads(succeed("info", "all.npz", "--json").stdout)
     assert list(said["fields"]) == ["density"] and list(said["no_fields"]) == list(others)
     result = succeed("export", "all.npz", "-o", "out.vdb")
@@ -193,13 +193,13 @@ def test_the_volume_of_a_scene(succeed: Run) -> None:
     field = report["fields"]["density"]
     assert report["resolution"] == [6, 5, 4] and field["colors"] == field["filled"] == 1
     assert 0 < field["min"] < field["mean"] < field["max"] < 1
-    told = succeed("info", "scene.yaml", *override).stdout.splitlines()
-    assert told[:2] == succeed("info", "density.npz").stdout.splitlines()
-    assert [line.split(":")[0] for line in told[2:]] == ["sigma_t", "albedo", "g"]
-    assert all(line.endswith(" everywhere") for line in told[2:])
+    lines = succeed("info", "scene.yaml", *override).stdout.splitlines()
+    assert lines[:2] == succeed("info", "density.npz").stdout.splitlines()
+    assert [line.split(":")[0] for line in lines[2:]] == ["sigma_t", "albedo", "g"]
+    assert all(line.endswith(" everywhere") for line in lines[2:])
 
 
 def test_an_image(succeed: Run) -> None:
     np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
-    told = "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
-    assert succeed("info", "picture.npy").stdout == told
+    line = "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
+    assert succeed("info", "picture.npy").stdout == line

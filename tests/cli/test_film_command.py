@@ -131,8 +131,8 @@ def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> N
     shared = json.loads((out / "shared.json").read_text())
     assert shared["frames"] == [0, 3]
     for number in range(FRAMES):
-        found = json.loads((out / f"frames/{number:04d}/parameters.json").read_text())
-        assert found["lights.0.irradiance"] == [shared["values"]["lights.0.irradiance"]]
+        parameters = json.loads((out / f"frames/{number:04d}/parameters.json").read_text())
+        assert parameters["lights.0.irradiance"] == [shared["values"]["lights.0.irradiance"]]
     # The ball rises by 0.05 u a frame: so says its velocity, where there is something.
     velocity, density = (
         read_field(out / f"frames/0003/volumes/{name}.npz", name).values
@@ -334,11 +334,11 @@ MISUSE = """
 
 @pytest.mark.parametrize("row", MISUSE.strip().splitlines())
 def test_misuse_is_one_line(film: Path, run: Run, row: str) -> None:
-    arguments, _, told = row.partition(" => ")
+    arguments, _, words = row.partition(" => ")
     Path("strange.json").write_text('{"values": {"views.top.exposure": 1.0}}')
     result = run(*optimize("-o", "out", *arguments.replace("e:{", "e: {").split(" ", 1)))
     assert result.exit_code == (3 if "scene.yaml" in arguments else 2)
-    assert told in result.stderr.splitlines()[0]
+    assert words in result.stderr.splitlines()[0]
 
 
 def test_misuse_of_folders(whole: str, film: Path, succeed: Run, refuse: Refuse) -> None:
@@ -348,11 +348,11 @@ def test_misuse_of_folders(whole: str, film: Path, succeed: Run, refuse: Refuse)
     other = refuse(2, *optimize("-o", "whole", "--resume", "-D", "volume.albedo=0.5"))[0]
     assert "another output folder: volume.albedo is 0.9 there, 0.5 now" in other
     for command, line in (("optimize", "is for films"), ("render", "is for the folders of films")):
-        told = refuse(2, command, "scene.yaml", "-o", "single", "--frames", "0:1")
-        assert f"--frames {line}" in told[-1]
+        lines = refuse(2, command, "scene.yaml", "-o", "single", "--frames", "0:1")
+        assert f"--frames {line}" in lines[-1]
     assert "names no frame" in refuse(2, "render", "whole", "-o", "seen", "--frames", "7:9")[0]
-    told = refuse(2, "optimize", "scene.yaml", "-o", "whole", "--overwrite")[0]
-    assert told.startswith("whole: is the folder of another kind of job, film")
+    lines = refuse(2, "optimize", "scene.yaml", "-o", "whole", "--overwrite")[0]
+    assert lines.startswith("whole: is the folder of another kind of job, film")
     (advice,) = re.findall("`ddrecon (.*)`", refuse(2, "export", "whole", "-o", "out.vdb")[0])
     succeed(*advice.split(), "-q", "--dtype", "float64", "--frames", "0:0")
     assert Path("whole/sequence/film_0000.vdb").is_file()

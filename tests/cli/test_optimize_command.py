@@ -56,13 +56,15 @@ previews/front.000004.png previews/side.000004.png"""
 
 def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     exact = "-D", "diffusion.tolerance=1e-6", "-D", "render.steps_per_voxel=1"
-    given = {"threads": 1, "seed": 7, "device": "cpu"}
-    options = [word for name, value in given.items() for word in (f"--{name}", str(value))]
+    values = {"threads": 1, "seed": 7, "device": "cpu"}
+    options = [word for name, value in values.items() for word in (f"--{name}", str(value))]
     options += "--preview-every", "2"
     result = succeed(*OPTIMIZE, "out", "--json", *options, *exact)
     assert set(contents(Path("out"))) == set(FILES.split())
-    told = read_json("out/environment.json")
-    assert (given | {"torch": torch.__version__, "dtype": "float32"}).items() <= told.items()
+    environment = read_json("out/environment.json")
+    assert (
+        values | {"torch": torch.__version__, "dtype": "float32"}
+    ).items() <= environment.items()
     parameters = read_json("out/parameters.json")
     assert parameters["g"] == pytest.approx(0.3) and parameters["lights.0.irradiance"] == [3]
     assert np.shape(parameters["views.front.camera"]["matrix"]) == (4, 4)
@@ -90,12 +92,12 @@ def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     found = "-D", "volume.density={file: out/volumes/density.npz}"
     succeed("render", "out/scene.yaml", "-o", "pictures", "-q", *found)
     rendered = read_json("pictures/render.json")["psnr"]
-    told = {name: view["psnr"] for name, view in summary["views"].items()}
-    assert rendered == pytest.approx(told, abs=1e-3)
+    environment = {name: view["psnr"] for name, view in summary["views"].items()}
+    assert rendered == pytest.approx(environment, abs=1e-3)
     # The report shows every view, field and setting.
     text = Path("out/report.html").read_text()
     assert text.count("<img ") == 2 * 2 + 1 and text.count("<svg viewBox") == 2
-    shown = [f"{name}: {psnr:.2f} dB" for name, psnr in told.items()]
+    shown = [f"{name}: {psnr:.2f} dB" for name, psnr in environment.items()]
     shown += ["density, middle slices", "irradiance: 3.0"]
     assert all(words in text for words in [*shown, "fluxes Q1 and L1", "torch"])
 
@@ -220,8 +222,8 @@ def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.Mo
     assert ended["text"] in result.stdout.splitlines()
     assert ended["text"] in Path("out/report.html").read_text()
     assert ended["residual"] > 0 < ended["noise"]
-    parts = f"off by {ended['residual']:.1%}, noise and model by {ended['noise']:.1%}"
-    assert parts in ended["text"]
+    words = f"off by {ended['residual']:.1%}, noise and model by {ended['noise']:.1%}"
+    assert words in ended["text"]
     succeed(*OPTIMIZE, "out", "--resume", "--iterations", "auto")
     assert rows("out") == log
 
@@ -269,9 +271,9 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     assert (result.exit_code, result.stdout) == (130, "")
     assert len(result.stderr.splitlines()) == 1 and "interrupted" in result.stderr
     assert len(rows("parts")) in (call - 1, call)
-    begun = Path("parts/report.html").read_text()
-    assert "It goes on." in begun and 'http-equiv="refresh"' in begun
-    assert all(f'<section id="{name}">' in begun for name in ("volume", "loss", "views"))
+    page = Path("parts/report.html").read_text()
+    assert "It goes on." in page and 'http-equiv="refresh"' in page
+    assert all(f'<section id="{name}">' in page for name in ("volume", "loss", "views"))
     succeed(*OPTIMIZE, "parts", *FINER, "--resume")
     assert column("parts", "iteration") == [1, 2, 3, 4]
     assert np.array_equal(density_of("parts"), density_of("whole"))
@@ -285,8 +287,8 @@ def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
     with monkeypatch.context() as patch:
         press_ctrl_c_in(patch, quality, "register", 1)
         result = run(*OPTIMIZE, "out")
-    told = "interrupted after 4 iterations; write its results with --resume\n"
-    assert (result.exit_code, result.stderr) == (130, told)
+    line = "interrupted after 4 iterations; write its results with --resume\n"
+    assert (result.exit_code, result.stderr) == (130, line)
     succeed(*OPTIMIZE, "out", "--resume")
     assert Path("out/report.html").is_file()
 

@@ -129,9 +129,9 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, said: int, made: int
 def test_it_is_said_whether_light_has_come_to_rest(
     count: int, residual: float, tolerance: float | None, verdict: str
 ) -> None:
-    told = rounds_text(count, residual, tolerance)
+    words = rounds_text(count, residual, tolerance)
     begin = f"transport rounds: {count}, the last changed light by {100 * residual:.2g} %: "
-    assert told.startswith(begin + verdict)
+    assert words.startswith(begin + verdict)
 
 
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
@@ -149,10 +149,10 @@ def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
 def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
     sky = "{type: ambient, radiance: 0.3}"
     lamp = "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}"
-    said = succeed(*RENDER, "--light", sky, "--light", lamp).stdout
+    words = succeed(*RENDER, "--light", sky, "--light", lamp).stdout
     relit = pixels("front")
     succeed(*RENDER, "--overwrite", "-D", f"lights=[{sky}, {lamp}]")
-    assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
+    assert np.array_equal(pixels("front"), relit) and "PSNR" not in words
 
 
 def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> None:
@@ -187,13 +187,13 @@ def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
     monkeypatch.setattr("ddrecon.run.render_folder.FEW", 2)
     options = [] if movie.startswith("out") else ["--movie", movie]
     ring = "--ring", "4", "--view", "front", "--size", "33", "21", "--fps", "12"
-    said = succeed(*RENDER, *ROUND, *ring, *options).stdout
-    assert "transport rounds: 1, " in said
+    words = succeed(*RENDER, *ROUND, *ring, *options).stdout
+    assert "transport rounds: 1, " in words
     report = json.loads(Path("out/render.json").read_text())
     names = [f"ring_{number:03d}" for number in range(4)]
     assert list(report["files"]) == names and report["psnr"] == {}
-    assert report["movie"]["file"] == movie and f"movie: {movie}" in said
-    assert "... 2 views between them" in said and f"{names[2]}: " not in said
+    assert report["movie"]["file"] == movie and f"movie: {movie}" in words
+    assert "... 2 views between them" in words and f"{names[2]}: " not in words
     if movie.endswith(".mp4"):
         assert frame_times(Path(movie)) == pytest.approx(np.arange(4) / 12)
         frames = [read_frame(Path(movie), number)[:21, :33] for number in range(4)]

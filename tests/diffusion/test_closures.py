@@ -91,9 +91,9 @@ def test_in_layers_that_repeat_the_distance_is_the_thickness_of_those_that_have_
     grid = Grid((4, 3, 2), (0, 0, 0), (2.0, 3.0, 1.0), periodic=(1, 2))
     weight = torch.zeros(1, *grid.shape, dtype=torch.float64)
     weight[:, 1:3] = 50 * random_values(2, 3, 2)
-    found = inverse_distance([Coefficient(torch.ones(()), weight)], grid)
+    actual = inverse_distance([Coefficient(torch.ones(()), weight)], grid)
     expected = torch.tensor([0.0, 1, 1, 0], dtype=torch.float64).view(1, 4, 1, 1)
-    torch.testing.assert_close(found, expected.expand_as(found), rtol=0, atol=0.01)
+    torch.testing.assert_close(actual, expected.expand_as(actual), rtol=0, atol=0.01)
 
 
 def test_flat_cells_have_distances_of_their_shape():
@@ -160,6 +160,6 @@ def test_centers_of_thin_cells_are_those_whose_means_are_known():
     z, y, x = grid.centers(one)
     light = (2 + z - 0.3 * y + 0.5 * z**2 + 0.2 * y**2 - 0.7 * x**2)[None]
     medium = scale_medium(Volume(grid, 0 * light[0], one, one, 0 * one[0]))
-    found = sharpen(medium, average(light))
+    actual = sharpen(medium, average(light))
     inner = (slice(None), *[slice(2, -2)] * 3)
-    torch.testing.assert_close(found[inner], light[inner], rtol=1e-13, atol=0)
+    torch.testing.assert_close(actual[inner], light[inner], rtol=1e-13, atol=0)

@@ -134,10 +134,10 @@ def test_a_cycle_and_a_solve_are_those_of_torch(shape: Shape):
     for colors, wraps in ((2, False), (1, True)):
         assert_steps_agree(patchy_box(shape, wraps, colors))
     operator, source = uneven(shape), random_values(2, *shape)
-    found, known = (solve(engine, operator, source, 1e-9) for engine in ("warp", "torch"))
-    assert found.iterations == known.iterations
-    assert_near(found.value, known.value, 1e-7)
-    assert solve("warp", operator, source, 1e-8, found.value).iterations == 0
+    actual, known = (solve(engine, operator, source, 1e-9) for engine in ("warp", "torch"))
+    assert actual.iterations == known.iterations
+    assert_near(actual.value, known.value, 1e-7)
+    assert solve("warp", operator, source, 1e-8, actual.value).iterations == 0
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -159,10 +159,10 @@ def test_grids_are_those_of_torch(form: str):
 @pytest.mark.parametrize(("patch", "dtype"), [(1, torch.float32), (4, torch.float64)], ids=str)
 def test_a_million_to_one(patch: int, dtype: torch.dtype):
     operator, source = patchy(patch, dtype), random_values(1, 16, 16, 16, dtype=dtype)
-    found, known = (solve(engine, operator, source, 1e-6) for engine in ("warp", "torch"))
-    assert abs(found.iterations - known.iterations) <= 0.1 * known.iterations
+    actual, known = (solve(engine, operator, source, 1e-6) for engine in ("warp", "torch"))
+    assert abs(actual.iterations - known.iterations) <= 0.1 * known.iterations
     exact = solve("torch", in_double(operator), source.double(), 1e-12).value
-    errors = [float((u.value - exact).norm()) for u in (found, known)]
+    errors = [float((u.value - exact).norm()) for u in (actual, known)]
     assert errors[0] <= 2 * errors[1]
 
 
@@ -171,9 +171,9 @@ def test_colors_share_conductances(losses: int):
     operator, source = uneven((6, 9, 7)), random_values(3, 6, 9, 7)
     loss = operator.loss[:1] + torch.arange(losses, dtype=torch.float64).view(-1, 1, 1, 1)
     shared = Operator(tuple(c[:1] for c in operator.conductances), loss)
-    found, known = (solve(engine, shared, source, 1e-10) for engine in ("warp", "torch"))
-    assert found.iterations == known.iterations
-    assert_near(found.value, known.value, 1e-8)
+    actual, known = (solve(engine, shared, source, 1e-10) for engine in ("warp", "torch"))
+    assert actual.iterations == known.iterations
+    assert_near(actual.value, known.value, 1e-8)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

@@ -218,8 +218,8 @@ def test_the_system_is_that_put_together_face_by_face(shape: tuple[int, int, int
 @pytest.mark.parametrize("shape", [(3, 2, 4), (1, 3, 1)], ids=str)
 def test_the_flux_is_that_of_each_cells_two_faces(shape: tuple[int, int, int]):
     problem, u = make_problem(shape, True), random_values(1, *shape, seed=7)
-    found = problem.flux(u)
-    assert found is not None and math.prod(shape) == u.numel()
-    for axis, component in enumerate(flux_along_axes(found)):
+    flux = problem.flux(u)
+    assert flux is not None and math.prod(shape) == u.numel()
+    for axis, component in enumerate(flux_along_axes(flux)):
         expected = FaceByFace(problem).mean_flux(u[0], axis)
         torch.testing.assert_close(component[0], expected, rtol=1e-12, atol=1e-12)

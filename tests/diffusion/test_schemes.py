@@ -214,17 +214,17 @@ def test_diffusion_falls_where_light_does_cell_by_cell():
             ends = [min(max(cell[axis] + side, 0), grid.shape[axis] - 1) for side in (-1, 1)]
             low, high = (u[0][(*cell[:axis], end, *cell[axis + 1 :])] for end in ends)
             square[cell] += 4 * ((high - low) / (h * (ends[1] - ends[0])) / u[0][cell]) ** 2
-    found = limit_diffusion(u, extinction, grid)[0]
-    torch.testing.assert_close(found, square**-0.5, rtol=1e-9, atol=0)
+    limited = limit_diffusion(u, extinction, grid)[0]
+    torch.testing.assert_close(limited, square**-0.5, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("value", [0.0, 2.0])
 def test_even_light_and_no_light_diffuse_with_one_third_of_the_transport_length(value: float):
     u = torch.full((2, 3, 4, 2), value, dtype=torch.float64, requires_grad=True)
-    found = limit_diffusion(u, torch.full_like(u, 1e4).detach(), box_grid((3, 4, 2)))
-    (slope,) = torch.autograd.grad(found.sum(), u)
+    limited = limit_diffusion(u, torch.full_like(u, 1e4).detach(), box_grid((3, 4, 2)))
+    (slope,) = torch.autograd.grad(limited.sum(), u)
     assert not slope.any()
-    torch.testing.assert_close(found, torch.full_like(u, 1 / 3e4), rtol=1e-9, atol=0)
+    torch.testing.assert_close(limited, torch.full_like(u, 1 / 3e4), rtol=1e-9, atol=0)
 
 
 def test_the_light_found_balances():
@@ -232,8 +232,8 @@ def test_the_light_found_balances():
     source, *fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
     u = solved(grid, SolveMemory(), 1e-13, source, *fields, outside)
-    left = LimitedOperator(grid, tensors=(*fields, outside)).apply(u) - source
-    assert float(left.abs().max()) < 1e-11 * float(u.abs().max())
+    residual = LimitedOperator(grid, tensors=(*fields, outside)).apply(u) - source
+    assert float(residual.abs().max()) < 1e-11 * float(u.abs().max())
 
 
 def test_dense_media_diffuse_as_without_a_limit(make):
@@ -282,6 +282,6 @@ def test_iterations_are_recorded_and_resumed(make):
 
 def test_giving_up_says_what_may_help(make, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(flux_limited, "MAX_ITERATIONS", 3)
-    told = r"flux-limited .*after 3 iterations .*diffusion\.model=p1"
-    with pytest.raises(SolveError, match=told):
+    words = r"flux-limited .*after 3 iterations .*diffusion\.model=p1"
+    with pytest.raises(SolveError, match=words):
         render(make())

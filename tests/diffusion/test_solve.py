@@ -102,8 +102,8 @@ def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
     operator = patchy_box(shape, wraps)
     coarsening, coarse = Passes().coarsen(operator, axis)
     fine, u = random_values(2, *shape, seed=5), random_values(2, *coarse.loss.shape[1:], seed=6)
-    one, other = (restrict(coarsening, fine) * u).sum(), (fine * prolong(coarsening, u)).sum()
-    torch.testing.assert_close(one, other, rtol=1e-13, atol=0)
+    down, up = (restrict(coarsening, fine) * u).sum(), (fine * prolong(coarsening, u)).sum()
+    torch.testing.assert_close(down, up, rtol=1e-13, atol=0)
     assert torch.equal(prolong(coarsening, torch.ones_like(u)), torch.ones_like(fine))
     torch.testing.assert_close(coarse.loss.sum(), operator.loss.sum())
 
@@ -160,8 +160,8 @@ def test_the_residual_is_reached_and_no_step_leads_away(dtype: torch.dtype, is_u
     solution = solve_by_multigrid(operator, source, None, tolerance)
     assert solution.residual <= tolerance and solution.iterations > 0
     exact, scale = in_double(operator), operator.diagonal.double().rsqrt()
-    left = scale * (source.double() - exact.apply(solution.value.double()))
-    sizes = [field.flatten(1).norm(dim=1) for field in (left, scale * source.double())]
+    residual = scale * (source.double() - exact.apply(solution.value.double()))
+    sizes = [field.flatten(1).norm(dim=1) for field in (residual, scale * source.double())]
     assert float((sizes[0] / sizes[1]).max()) < 2 * tolerance
     again = solve_by_multigrid(operator, source, solution.value, 10 * tolerance)
     assert again.iterations == 0
@@ -174,8 +174,8 @@ def test_colors_do_not_mix_and_may_share_conductances(losses: int):
     faces, loss = [c[:1] for c in operator.conductances], operator.loss[:losses]
     together = solve_by_multigrid(Operator(tuple(faces), loss), source, None, 1e-11).value
     for c in range(3):
-        one = Operator(tuple(faces), loss[c : c + 1] if losses == 3 else loss)
-        alone = solve_by_multigrid(one, source[c : c + 1], None, 1e-11).value
+        of_color = Operator(tuple(faces), loss[c : c + 1] if losses == 3 else loss)
+        alone = solve_by_multigrid(of_color, source[c : c + 1], None, 1e-11).value
         torch.testing.assert_close(together[c : c + 1], alone, rtol=1e-8, atol=0)
 
 
@@ -184,8 +184,8 @@ def test_a_useless_start_does_no_harm(is_fitting: bool):
     """A guess that is worse than zero, or of another grid, is not used."""
     operator, source = patchy_box((4, 5, 3)), random_values(2, 4, 5, 3, seed=3)
     guess = 1e9 * random_values(*source.shape) if is_fitting else random_values(2, 3, 3, 3)
-    found, known = (solve_by_multigrid(operator, source, u, 1e-8).value for u in (guess, None))
-    assert torch.equal(found, known)
+    warm, known = (solve_by_multigrid(operator, source, u, 1e-8).value for u in (guess, None))
+    assert torch.equal(warm, known)
 
 
 def test_no_source_no_light():

@@ -123,9 +123,9 @@ def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[flo
     # Rays that enter more than a slice later count as if they entered then.
     for through, size, part in zip(ways, grid.spacing, travel, strict=True):
         same &= through > 2 * size / part.abs()
-    found = mass_to_centers(torch.full(grid.shape, 3.0, dtype=torch.float64), grid, travel)
+    mass = mass_to_centers(torch.full(grid.shape, 3.0, dtype=torch.float64), grid, travel)
     assert int(same.sum()) > 100
-    torch.testing.assert_close(found[same], 3 * way[same], rtol=1e-13, atol=0)
+    torch.testing.assert_close(mass[same], 3 * way[same], rtol=1e-13, atol=0)
 
 
 def test_what_comes_through_a_side_is_received():
@@ -180,15 +180,15 @@ def test_cells_together_receive_the_power_of_a_beam(axis: tuple[float, ...], rad
 def test_a_profile_is_the_mean_of_the_gaussian_over_each_cell(axis: tuple[float, ...]) -> None:
     grid, direction, radius = box_grid((4, 5, 6)), tensor(*axis), 0.4
     place = tensor(0.1, -0.05, 0.02)
-    found = profile_in(grid, place, direction, tensor(radius)[0])[0]
+    irradiance = profile_in(grid, place, direction, tensor(radius)[0])[0]
     fine = box_grid((40, 50, 60))
-    z, y, x = torch.broadcast_tensors(*fine.centers(found))
+    z, y, x = torch.broadcast_tensors(*fine.centers(irradiance))
     offset = torch.stack([x, y, z], -1) - place
     travel = direction / direction.norm()
     square = offset.square().sum(-1) - (offset @ travel) ** 2
     exact = 2 / (math.pi * radius**2) * torch.exp(-2 * square / radius**2)
     mean = torch.nn.functional.avg_pool3d(exact[None, None], 10)[0, 0]
-    torch.testing.assert_close(found, mean, rtol=0, atol=1e-2 * float(mean.max()))
+    torch.testing.assert_close(irradiance, mean, rtol=0, atol=1e-2 * float(mean.max()))
 
 
 @pytest.mark.parametrize(
@@ -359,8 +359,8 @@ def test_in_even_columns_parts_of_cells_receive_what_cells_do(g: float):
     lights = [DirectionalLight(tensor(0, 0, -2), tensor(2, 1))]
     lights += [DirectionalLight(tensor(0, 3, 0), tensor(1, 1))]
     narrow = average_cells(refine_medium(medium, 3))
-    whole, parts = (receive_light(medium, lights, 1, cells).source for cells in (None, narrow))
-    torch.testing.assert_close(parts, whole, rtol=1e-12, atol=0)
+    whole, in_parts = (receive_light(medium, lights, 1, cells).source for cells in (None, narrow))
+    torch.testing.assert_close(in_parts, whole, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("zenith", [10.0, 60.0, 75.0])

@@ -158,15 +158,15 @@ def test_images_and_derivatives_are_those_without_it(engine: str, settings: dict
         scene_with(given, settings, names is RAYS, size=size) for given in (None, support)
     )
     values = values_of(within, names)
-    found = differentiate(engine, images_of(within), values, has_tangent=True)
-    assert_transposes(found, values)
+    derivatives = differentiate(engine, images_of(within), values, has_tangent=True)
+    assert_transposes(derivatives, values)
 
     def show(values: Tensors) -> list[Tensor]:
         """Without a support, of which the density outside varies as little as with it."""
         density = values["density"] * support + (values["density"] * (1 - support)).detach()
         return images_of(without)(values | {"density": density})
 
-    assert_same(found, differentiate(engine, show, values, has_tangent=True), 1e-11)
+    assert_same(derivatives, differentiate(engine, show, values, has_tangent=True), 1e-11)
     outside = differentiate(engine, images_of(without), values)["by density"] * (1 - support)
     assert bool(outside.any())
 

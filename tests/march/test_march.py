@@ -177,8 +177,8 @@ def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
         return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
 
     def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
-        found = along(seen, depth, angle.cos())
-        return found.movedim(0, 1) if depth is None and seen.number is None else found
+        actual = along(seen, depth, angle.cos())
+        return actual.movedim(0, 1) if depth is None and seen.number is None else actual
 
     monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
     monkeypatch.setattr(SeenPhase, "along", along)

@@ -164,5 +164,5 @@ def test_fluence_in_finer_cells_is_that_of_cells_as_given():
     """Of even light without absorption it is 4 pi times that, in every cell."""
     options = {"directional": None, "ambient": (0.5,), "sigma_a": (0.0,), "refine": 3}
     scene = make_scene(random_values(*FLAT), grid=GRID, sigma_s=(9.0,), **options)
-    found = fluence(scene, SolveMemory())
-    torch.testing.assert_close(found, torch.full((1, *FLAT), 2 * torch.pi, dtype=torch.float64))
+    actual = fluence(scene, SolveMemory())
+    torch.testing.assert_close(actual, torch.full((1, *FLAT), 2 * torch.pi, dtype=torch.float64))

@@ -101,8 +101,8 @@ def test_a_table_is_of_fourth_order_and_smooth():
 
 def test_a_table_meets_its_values_and_has_both_derivatives():
     table = torch.rand(2, 5, 2, 3, dtype=torch.float64).requires_grad_()
-    found = look_up(table, even_angles(4))
-    torch.testing.assert_close(found, table[:, :, 0])
+    actual = look_up(table, even_angles(4))
+    torch.testing.assert_close(actual, table[:, :, 0])
     angles = torch.tensor([0.1, 1.4, 3.0], dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(look_up, (table, angles), check_forward_ad=True)
 

@@ -139,8 +139,8 @@ def test_the_flow_of_a_moved_blob_is_its_motion(shift: tuple[float, float, float
     weight = after / after.sum()
     mean = (flow * weight).sum((1, 2, 3))
     assert (mean - mean.new_tensor(shift)).norm() <= 0.03 + 0.05 * mean.norm()
-    left = (carry(before, flow) - after).norm() / after.norm()
-    assert left < 0.05
+    error = (carry(before, flow) - after).norm() / after.norm()
+    assert error < 0.05
 
 
 def test_a_motion_of_whole_cells_shifts() -> None:

@@ -117,8 +117,8 @@ def test_what_a_support_cuts_off_is_told_with_the_view_that_does(rows: int) -> N
     shown[3] = torch.roll(shown[3], -rows, 0)
     support, grid = Support(scene.views, shown, 0.0), scene.volume.grid
     found = with_values(scene, {"density": scene.volume.density * support.on(grid)})
-    told = diagnose(findings_of(found), *AT_REST, support)
-    texts = [each["text"] for each in told if each["kind"] == "support"]
+    diagnoses = diagnose(findings_of(found), *AT_REST, support)
+    texts = [each["text"] for each in diagnoses if each["kind"] == "support"]
     assert len(texts) == (rows > 0)
     assert all(f"check camera {scene.views[3].name}, which alone" in text for text in texts)
 

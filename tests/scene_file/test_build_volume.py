@@ -76,8 +76,8 @@ def test_values_by_height_are_linear_between_them_and_even_beyond(load: Load, up
     medium = load(volume((), density=density, sigma_a=gas, up=up), dtype=torch.float64).volume
     place = medium.grid.centers(medium.density)["zyx".index(up)]
     torch.testing.assert_close(medium.density, (place + 9).expand(SHAPE))
-    part = (0.5 + 2 * place).clamp(0, 1)
-    expected = torch.stack([top + (1 - top) * part for top in (1, 2, 3)]).expand(3, *SHAPE)
+    fraction = (0.5 + 2 * place).clamp(0, 1)
+    expected = torch.stack([top + (1 - top) * fraction for top in (1, 2, 3)]).expand(3, *SHAPE)
     torch.testing.assert_close(medium.sigma_a, expected)
 
 

@@ -321,9 +321,11 @@ def test_slices_at_once_are_cells_one_by_one(direction):
     grid = box_grid((3, 4, 5))
     medium, scatters = medium_of(4 * random_values(3, 4, 5), grid), random_source(grid)
     even = random_values(*grid.shape, seed=2)
-    found, *_ = radiance_along(medium, scatters, cell_gradient(even[None]), outside(0.3), direction)
+    radiance, *_ = radiance_along(
+        medium, scatters, cell_gradient(even[None]), outside(0.3), direction
+    )
     expected = by_cells(medium, scatters[0], even, direction, 0.3)
-    torch.testing.assert_close(found[0], expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(radiance[0], expected, rtol=1e-12, atol=0)
 
 
 @each_direction
@@ -339,8 +341,8 @@ def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: flo
     absorbed = (medium.extinction.value * mean).sum() * course.step
     # All of what leaves the last slice, and of the outermost rows and columns what drifts out.
     shares = 1.0, *map(abs, course.drift)
-    left = sum(share * beyond.sum() for share, beyond in zip(shares, gone, strict=True))
-    torch.testing.assert_close(emitted, absorbed + left, rtol=1e-12, atol=1e-13)
+    leaked = sum(share * beyond.sum() for share, beyond in zip(shares, gone, strict=True))
+    torch.testing.assert_close(emitted, absorbed + leaked, rtol=1e-12, atol=1e-13)
 
 
 @each_direction
