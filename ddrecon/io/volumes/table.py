@@ -23,7 +23,6 @@ from ddrecon.io.files.atomic import replace_file, write_bytes
 from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
 from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields, check_field
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
-from ddrecon.io.volumes.nvdb import nvdb_names, read_nvdb
 from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 
 BOUNDS = "bounds"
@@ -108,7 +107,6 @@ FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
     ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
-    ".nvdb": VolumeFormat(None, read_nvdb, nvdb_names),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]

@@ -180,9 +180,14 @@ class Grid:
             for start, value in zip(starts, nodes.values, strict=True):
                 values[_overlap(start, nodes.side, values.shape)[0]] = value
         for start in leaves:
-            block = self.read_leaf().reshape(SIDE, SIDE, SIDE, -1)
+            is_active, buffers = self.stream.bits(VOXELS), 1
+            if self.version < NODE_MASKS:
+                *_, buffers = self.stream.unpack("<3ib")
+            block = self.read_masked(is_active).reshape(SIDE, SIDE, SIDE, -1)
             place, inside = _overlap(start, SIDE, values.shape)
             values[place] = block[inside]
+            for _ in range(buffers - 1):  # of a simulation, of which the first counts
+                self.read_many(VOXELS)
 
     def read_topology(self) -> Iterator[Nodes]:
         """All tiles that are active or no background, and all leaves, in the order of voxels.
@@ -194,7 +199,8 @@ class Grid:
         stream.at = self.begin
         if stream.unpack("<I") != (1,):
             raise ValueError("a tree has several buffers")
-        yield self.background_of(self.read_singles(1))
+        self.background = self.read_singles(1)
+        yield Nodes(np.full((1, 3), -FAR), 2 * FAR, np.zeros(1, bool), self.background)
         tiles, roots = stream.unpack("<II")
         layout = [("corner", "<i4", 3), ("value", self.single, (self.components,))]
         table = stream.array(np.dtype([*layout, ("is_active", "u1")]), tiles)
@@ -212,42 +218,15 @@ class Grid:
             values[~is_child] = self.read_masked(is_active[~is_child])
         else:
             values = self.read_masked(is_active)
-        yield self.tiles_of(corner, is_child, is_active, values, size, *below)
-        children = _children(corner, size, side)[is_child]
+        is_tile = ~is_child & (is_active | (values != self.background).any(1))
+        corners = corner + side * np.indices([2**size] * 3).reshape(3, -1).T
+        yield Nodes(corners[is_tile], side, is_active[is_tile], values[is_tile])
+        children = corners[is_child]
         if len(below) == 1:
             yield Nodes(children, side, stream.bits(VOXELS * len(children)).reshape(-1, VOXELS))
         else:
             for child in children:
                 yield from self.read_node(child, *below)
-
-    def background_of(self, value: np.ndarray) -> Nodes:
-        """A tile everywhere, of the background's `value` [1, C]."""
-        self.background = value
-        return Nodes(np.full((1, 3), -FAR), 2 * FAR, np.zeros(1, bool), value)
-
-    def tiles_of(
-        self,
-        corner: np.ndarray,
-        is_child: np.ndarray,
-        is_active: np.ndarray,
-        values: np.ndarray,
-        size: int,
-        *below: int,
-    ) -> Nodes:
-        """What of a node's `values` are tiles that are active or no background."""
-        is_tile = ~is_child & (is_active | (values != self.background).any(1))
-        corners = _children(corner, size, 2 ** sum(below))[is_tile]
-        return Nodes(corners, 2 ** sum(below), is_active[is_tile], values[is_tile])
-
-    def read_leaf(self) -> np.ndarray:
-        """The values [512, C] of the next leaf."""
-        is_active, buffers = self.stream.bits(VOXELS), 1
-        if self.version < NODE_MASKS:
-            *_, buffers = self.stream.unpack("<3ib")
-        values = self.read_masked(is_active)
-        for _ in range(buffers - 1):  # of a simulation, of which the first counts
-            self.read_many(VOXELS)
-        return values
 
     def read_masked(self, is_active: np.ndarray) -> np.ndarray:
         """The next values of a node or leaf, [n, C]; those that are not active may be left out.
@@ -291,11 +270,6 @@ class Grid:
         if len(data) != size:
             raise ValueError(f"values of {size} bytes have {len(data)}")
         return np.frombuffer(data, self.stored).reshape(count, self.components)
-
-
-def _children(corner: np.ndarray, size: int, side: int) -> np.ndarray:
-    """The corners [n, 3] of a node's children, 2^`size` along an axis, of a `side`."""
-    return corner + side * np.indices([2**size] * 3).reshape(3, -1).T
 
 
 def _overlap(start: list[int], side: int, shape: tuple[int, ...]) -> tuple[Slices, Slices]:
@@ -374,14 +348,10 @@ def read_vdb(path: Path, name: str) -> Field:
     Raises FormatError where it is no fog volume, is empty, takes too much memory, or has values
     that are not legal; what is damaged raises ValueError. Warns of a grid that is resampled.
     """
-    return read_grid(read_grids(path), name)
-
-
-def read_grid(grids: Mapping[str, Grid], name: str) -> Field:
-    """The grid `name` of `grids`, as `read_vdb`."""
+    grids = read_grids(path)
+    if fault := grids[name].fault:
+        raise FormatError(path, f"{name} {fault}")
     grid = grids[name]
-    if grid.fault:
-        raise FormatError(grid.stream.path, f"{name} {grid.fault}")
     box, center = _place(grid, grids.values())
     sides = box[1] - box[0]
     is_along = np.abs(grid.steps) > UPRIGHT * np.abs(grid.steps).max(1, keepdims=True)
@@ -394,7 +364,7 @@ def read_grid(grids: Mapping[str, Grid], name: str) -> Field:
     grid.fill(values.transpose(2, 1, 0, 3)[flips].transpose(*np.argsort(order), 3), box[0])
     corner = center - grid.steps.sum(0) / 2
     bounds = np.sort([corner, corner + sides @ grid.steps], axis=0)
-    return check_field(grid.stream.path, name, values, bounds)
+    return check_field(path, name, values, bounds)
 
 
 def _place(grid: Grid, grids: Iterable[Grid]) -> tuple[np.ndarray, np.ndarray]:
