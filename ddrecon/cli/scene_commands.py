@@ -94,7 +94,7 @@ def render(
         return
     if choice["movie"] is not None:
         raise click.UsageError("--movie is of one frame: name it, such as FILM/frames/0003")
-    from ddrecon.film.drive import finished_frames
+    from ddrecon.film import finished_frames
 
     outcomes: dict[str, Outcome] = {}
     with session.claim(RENDER) as folder:
@@ -196,20 +196,20 @@ def _optimize_film(
     exported: str | None,
     up: str | None,
 ) -> Outcome:
-    """Reconstructs the frames of a film that are this rank's."""
-    from ddrecon.film.drive import Film, choose_frames, open_film, share_out
-    from ddrecon.film.report import drive_film
-    from ddrecon.ranks import alone, from_first, is_first
+    """Reconstructs the `frames` of a film."""
+    from ddrecon.film import Film, drive_film, open_film
+    from ddrecon.io.files.folders import FILM
+    from ddrecon.ranks import rank_count
 
     environment = session.environment()
+    if rank_count() > 1:
+        advice = "give each process an -o of its own, --frames and --shared"
+        raise UsageError(f"torchrun: one process makes a film; {advice}")
     film = Film(scene_file, session.output, session.build, environment, preview_every)
-    numbers = share_out(choose_frames(film.frames.numbers, frames))
-    if is_first():
-        choice = {"overwrite": session.overwrite, "resume": session.resume}
-        open_film(film, frames, shared=shared, **choice)
-    from_first(None)  # others find the folder as it is to be
-    with alone():
-        return drive_film(film, numbers, exported, up)
+    with session.claim(FILM) as folder:
+        assert folder is not None
+        numbers = open_film(film, folder, frames, shared, is_resumed=session.resume)
+        return drive_film(film, folder, numbers, exported, up)
 
 
 @command("RUN", "output overwrite experiments resume report", is_shared=True)
