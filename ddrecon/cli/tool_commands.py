@@ -12,7 +12,6 @@ import click
 
 from ddrecon.cli.command import SCENE_SUFFIXES, command
 from ddrecon.errors import UsageError
-from ddrecon.io.files.reading import guard_reading
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -198,14 +197,7 @@ def info(session: Session, source: Path) -> None:
 
 
 def _require_volumes(session: Session, sources: Sequence[Path]) -> None:
-    """Raises FormatError for a source that is no scene and is not there, before imports.
-
-    UsageError where nothing is a scene that `session` could override.
-    """
-    for path in sources:
-        if path.suffix not in SCENE_SUFFIXES:
-            with guard_reading(path):
-                pass
+    """Raises UsageError where nothing is a scene that `session` could override."""
     if session.overrides and not any(map(_is_scene, sources)):
         raise click.UsageError("-D changes a scene file; name one")
 

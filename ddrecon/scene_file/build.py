@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import choose_diffusion, count_colors
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather, suggestion
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -52,7 +52,6 @@ from ddrecon.variables.values import (
     find_volume_readers,
     name_each,
     value_of,
-    variable_names,
 )
 
 LIGHTS: dict[type, Callable[..., Light]] = {
@@ -272,9 +271,8 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     key, cells = f"optimize.parameters.{name}", scene.volume.grid.shape
     try:
         value = value_of(scene, name).clone()
-    except UsageError:
-        fault = f"the scene has no such number{suggestion(name, variable_names(scene))}"
-        raise scene_file.refused(key, fault) from None
+    except UsageError as error:
+        raise scene_file.refused(key, str(error)) from None
     kind, init, is_field = kind_of(name), settings.init, settings.field
     if name == "emission" and _is_dark(value):
         # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.

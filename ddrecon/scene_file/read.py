@@ -185,8 +185,11 @@ def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     """That of `kinds` which the mapping `node` is, by its `type` or first required key."""
     entries = node.entries()
     if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
-        needs = {kind: [key.name for key in fields(kind) if is_required(key)] for kind in kinds}
-        return next((kind for kind in kinds if entries.keys() & set(needs[kind])), kinds[0])
+        needs = [(kind, [key.name for key in fields(kind) if is_required(key)]) for kind in kinds]
+        told = {kind: name for kind, names in needs for name in names if name in entries}
+        if len(told) > 1:
+            raise node.refused(f"give only one of {' or '.join(told.values())}")
+        return next(iter(told), kinds[0])
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}

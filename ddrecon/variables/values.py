@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import twist
-from ddrecon.errors import UsageError
+from ddrecon.errors import UsageError, nearest
 from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume, remix
@@ -212,7 +212,11 @@ def is_real(value: object) -> bool:
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
-    names = [known for known in variable_names(scene) if not known.startswith("views.")]
+    names = variable_names(scene)
+    components = [f"{n}.{c}" for n in names for c in component_names(n, value_of(scene, n))]
+    if near := nearest(name, [*names, *components]):
+        return UsageError(f"no variable {name!r}{near}")
+    names = [known for known in names if not known.startswith("views.")]
     hints = [f"besides views, the scene has {', '.join(names)}"]
     if scene.views:
         view = scene.views[0]
@@ -340,7 +344,7 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
             change = torch.zeros_like(value)
             change[components.index(component)] = 1
             return owner, change
-    raise UsageError(f"the scene has no number {name}")
+    raise _unknown(scene, name)
 
 
 @contextmanager
