@@ -38,9 +38,8 @@ from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.job import Outcome
 from ddrecon.run.run_folder import write_volume
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, place_turntable
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import place_turntable
 from ddrecon.variables.values import (
     variation,
     varied,

@@ -31,7 +31,7 @@ from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume, mix_media
 from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, require_above, require_supported
 from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
@@ -45,7 +45,6 @@ from ddrecon.scene_file.schema import (
     PointSection,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
-from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
     component_names,

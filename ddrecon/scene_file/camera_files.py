@@ -24,8 +24,7 @@ from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.read import path_in, read_as
+from ddrecon.scene_file.read import Node, path_in, read_as
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,
