@@ -5,10 +5,7 @@ It takes many small operations, and reads of numbers for which a processor waits
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
 
 from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
 from ddrecon.grid import Grid
@@ -17,8 +14,6 @@ from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import RaySampling, choose_sampling
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -47,22 +42,7 @@ def look_along(grid: Grid, rays: Rays, settings: RenderSettings) -> Sight:
     )
 
 
-def remember_of_camera(function: Callable[..., T]) -> Callable[..., T]:
-    """`function` of a camera, kept while the fields of that stay and are not varied."""
-
-    @remember
-    def find(count: int, *arguments: Any) -> T:
-        return function(Camera(*arguments[:count]), *arguments[count:])
-
-    @functools.wraps(function)
-    def recall(camera: Camera, *others: Any) -> T:
-        values = [getattr(camera, field.name) for field in fields(camera)]
-        return find(len(values), *values, *others)
-
-    return recall
-
-
-@remember_of_camera
+@remember
 def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
     """The sight of all rays of `camera`, bundle by bundle of its subpixels; it is kept."""
     rays = cast_rays(camera, *subpixel_offsets(settings.samples_per_pixel))

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, remember_of_phase
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
@@ -321,12 +321,12 @@ def _scale_sections(
 _remember_scaled = remember(_scale_sections)
 
 
-@remember_of_phase
+@remember
 def _mean_cosine(phase: PhaseFunction) -> Tensor:
     return _by_color(phase.moments(2)[:, 1])
 
 
-@remember_of_phase
+@remember
 def peak_fraction(phase: PhaseFunction, degree: int, sign: int) -> Tensor:
     """The part of scattering that a peak is, f or b by the `sign`, as of `Medium`."""
     return _by_color(phase.peak_tail(degree, 1, sign)[:, 0])

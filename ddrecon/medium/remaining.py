@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import P1_DEGREE, Medium, peak_fraction
-from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
+from ddrecon.medium.phase import PhaseFunction, henyey_greenstein
 from ddrecon.medium.phase_peak import (
     is_scaled,
     number_place,
@@ -14,7 +14,7 @@ from ddrecon.medium.phase_peak import (
     peak_moments,
     tabulate_series,
 )
-from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.numerics.remember import is_any_nonzero, remember
 from ddrecon.numerics.series import legendre, look_up, series_weights, sum_series
 
 
@@ -27,7 +27,7 @@ def remaining_moments(medium: Medium) -> Tensor:
     return _remaining(medium.seen.phase, medium.forward_fraction, medium.seen.degree)
 
 
-@remember_of_phase
+@remember
 def _remaining(phase: PhaseFunction, fraction: Tensor, degree: int) -> Tensor:
     moments = phase.moments(degree + 1).transpose(0, 1)
     moments = moments if moments.ndim == 5 else moments[..., None, None, None]
@@ -55,7 +55,7 @@ def has_backward_peak(medium: Medium) -> bool:
     return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
 
 
-@remember_of_phase
+@remember
 def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
     """How light that a backward peak has turned scatters once more, towards a camera (E8.12).
 
@@ -72,13 +72,14 @@ def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
     """How light turned so often scatters by `angle` [z, y, x] in cells, [C, z, y, x] (E8.12)."""
     phase, degree = medium.seen.phase, medium.seen.degree
-    number, kind, cosine = phase.cells, phase.kind, angle.cos().to(phase.numbers[-1])
+    number = phase.cells
     assert number is not None
+    cosine = angle.cos().to(number)
     table = number_table(phase, turned_table, True, -1, degree, turns).to(number)
     coefficients = look_up(table, angle.double()).unbind(-1)
-    if not is_scaled(kind):
-        return sum_series(coefficients, number_place(kind, number))
-    turned = sum_series(coefficients, number_place(kind, -number))
+    if not is_scaled(phase):
+        return sum_series(coefficients, number_place(phase, number))
+    turned = sum_series(coefficients, number_place(phase, -number))
     # Where g is positive nothing is turned back, and the forward peak counts as not scattered.
     moments = (phase.moments(degree + 1) - phase.peak_tail(degree, 1)).movedim(1, -1)
     forward = (series_weights(moments) * legendre(cosine, degree + 1)).sum(-1)

@@ -188,8 +188,7 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
         weight = complement.item() if phase.cells is None else _grid_volume(complement, grid)
         return {"type": "blendphase", "weight": weight, "first": first, "second": second}
     cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
-    numbers = (number.detach().cpu().double() for number in phase.numbers)
-    values = phase.kind(*numbers).value(cosines)
+    values = phase.map(lambda number: number.detach().cpu().double()).value(cosines)
     return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
 
 
