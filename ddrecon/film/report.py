@@ -14,7 +14,7 @@ from ddrecon.film.drive import SHARED, Film, drive_frames, export_film, fields_i
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import FILM
 from ddrecon.io.images.table import read_image, webp_of
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import pixels, shrink
 from ddrecon.run.job import Outcome
@@ -138,7 +138,7 @@ def _figures(
             image = shrink(torch.from_numpy(stored).permute(2, 0, 1), WIDEST)
             psnr = summaries[number]["views"][name]["psnr"]
             caption = f"{name}, frame {number}: {psnr:.2f} dB"
-            strip.append((webp_of(srgb.encode_bytes(pixels(image))), caption))
+            strip.append((webp_of(encode_bytes(pixels(image))), caption))
     return strips
 
 

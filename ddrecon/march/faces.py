@@ -22,8 +22,13 @@ from ddrecon.grid import Grid
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import Inflow, OutgoingLight
-from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import (
+    Medium,
+    for_channels,
+    mean_width,
+    remaining_moments,
+    thinness,
+)
 from ddrecon.numerics.autodiff import differentiate_once, is_fused, run_plainly
 from ddrecon.numerics.remember import remember
 
@@ -39,6 +44,8 @@ OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
 FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order of what differs from face to face."""
+_Entries = tuple[Tensor, Tensor, Tensor]
+"""Rows, columns and weights of a sparse matrix."""
 _Along = tuple[Tensor, Tensor]
 """Of each place along an axis two entries [places, 2]: which cells they are, and their weights."""
 
@@ -78,18 +85,21 @@ class _Pair(NamedTuple):
     transposed: _Table
 
     @staticmethod
-    def of(matrix: Tensor, dtype: torch.dtype, device: torch.device) -> _Pair:
-        """Of torch's sparse `matrix`."""
+    def of(
+        height: int, width: int, entries: _Entries, dtype: torch.dtype, device: torch.device
+    ) -> _Pair:
+        """The matrix [height, width] that has these `entries`, and its transpose."""
 
-        def table(matrix: Tensor) -> _Table:
-            (rows, columns), weights = matrix.indices(), matrix.values()
+        def table(size: int, rows: Tensor, columns: Tensor, weights: Tensor) -> _Table:
+            rows, order = rows.sort(stable=True)
             filled, counts = rows.unique_consecutive(return_counts=True)
             starts = pad(counts.cumsum(0), (1, 0))
-            numbers = (t.to(device, torch.int32) for t in (rows, columns, filled, starts))
+            numbers = (t.to(device, torch.int32) for t in (rows, columns[order], filled, starts))
             rows, columns, filled, starts = numbers
-            return _Table(len(matrix), rows, columns, weights.to(device, dtype), filled, starts)
+            return _Table(size, rows, columns, weights[order].to(device, dtype), filled, starts)
 
-        return _Pair(table(matrix.coalesce()), table(matrix.t().coalesce()))
+        rows, columns, weights = entries
+        return _Pair(table(height, rows, columns, weights), table(width, columns, rows, weights))
 
     def times(self, values: Tensor, within: Tensor | None = None) -> Tensor:
         """The product [C, height] with `values` [C, width].
@@ -291,7 +301,9 @@ def _beside(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
     """Those cells of all, [S, cells]."""
     number, none = torch.arange(grid.cells).view(grid.shape), torch.zeros(0, dtype=torch.long)
     layers = (number.select(axis, -side).flatten() for axis, side in _faces_of(grid))
-    return _Pair.of(_choose(torch.cat([none, *layers]), grid.cells), dtype, device)
+    cells = torch.cat([none, *layers])
+    entries = torch.arange(len(cells)), cells, torch.ones(len(cells))
+    return _Pair.of(len(cells), grid.cells, entries, dtype, device)
 
 
 @remember
@@ -356,29 +368,35 @@ def _find_places(grid: Grid) -> tuple[Tensor, Tensor]:
 def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
     """The places around the box of `grid`; across `axis` those that are extended are on faces."""
     places, cells = _find_places(grid)
+    wide, count = [n + 2 for n in grid.shape], len(places)
 
-    def multiply(sizes: Sequence[int], axes: Sequence[_Along]) -> Tensor:
-        """The product of three matrices, one an axis, with columns for `sizes`, at the places."""
-        columns, weights = torch.zeros(len(places), 1).long(), torch.ones(len(places), 1).double()
-        numbers = torch.unravel_index(places, [count + 2 for count in grid.shape])
+    def multiply(axes: Sequence[_Along], sizes: Sequence[int]) -> _Entries:
+        """The product of three matrices, one an axis, with columns for `sizes`: at the places."""
+        columns, weights = torch.zeros(count, 1).long(), torch.ones(count, 1).double()
+        numbers = torch.unravel_index(places, wide)
         for (entries, parts), number, size in zip(axes, numbers, sizes, strict=True):
             columns = (columns[:, :, None] * size + entries[number][:, None]).flatten(1)
             weights = (weights[:, :, None] * parts[number][:, None]).flatten(1)
         rows, which = weights.nonzero(as_tuple=True)
-        entries = rows, columns[rows, which], weights[rows, which]
-        return _sparse(*entries, len(places), math.prod(sizes))
+        return rows, columns[rows, which], weights[rows, which]
 
-    def spread(matrix: Tensor) -> Tensor:
-        """The same with a row for each place of an extended field."""
-        (rows, columns), size = matrix.coalesce().indices(), len(places) + len(cells)
-        weights = matrix.coalesce().values()
-        return _sparse(places[rows], columns, weights, size, matrix.shape[1])
+    def choose(chosen: Tensor) -> _Entries:
+        """The columns of what stands beyond faces that are `chosen` places."""
+        number = torch.full((math.prod(wide),), -1)
+        number[chosen] = torch.arange(len(chosen))
+        rows, columns, weights = multiply(beyond, wide)
+        is_there = number[columns] >= 0
+        return rows[is_there], number[columns[is_there]], weights[is_there]
+
+    def pair(height: int, width: int, *blocks: _Entries) -> _Pair:
+        rows, columns, weights = (torch.cat(many) for many in zip(*blocks, strict=True))
+        return _Pair.of(height, width, (rows, columns, weights), dtype, device)
 
     nearest, on_line, beyond = list[_Along](), list[_Along](), list[_Along]()
-    for along, count in enumerate(grid.shape):
-        place = torch.arange(count + 2)
-        cell = place.clamp(1, count)
-        inward = (2 * cell - place).clamp(1, count)
+    for along, size in enumerate(grid.shape):
+        place = torch.arange(size + 2)
+        cell = place.clamp(1, size)
+        inward = (2 * cell - place).clamp(1, size)
         share = ((cell != place) & (inward != cell)).double()[:, None]
         ends = torch.cat([1 + share, -share], 1)
         no_line = ends.new_tensor([1.0, 0.0]).expand_as(ends)
@@ -387,48 +405,40 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         on_line.append((on_cells, (no_line + ends) / 2))
         # Of light on faces: as far beyond as the cell is before.
         beyond.append((torch.stack([place, cell], 1), no_line if along == axis else ends))
-    same = multiply(grid.shape, nearest)
-    wide = multiply([count + 2 for count in grid.shape], beyond)
+    order, ones, all_places = torch.arange(count), torch.ones(count).double(), math.prod(wide)
+    same, by_cells, by_faces = multiply(nearest, grid.shape), choose(cells), choose(places)
+    blocks = enumerate([same, multiply(on_line, grid.shape), by_cells])
+    lines = [(k * count + rows, columns, weights) for k, (rows, columns, weights) in blocks]
     # Light on faces, then what is made of cells.
-    unit = _choose(torch.arange(len(places)), len(places))
-    around = spread(torch.cat([wide.index_select(1, places), unit], 1))
-    lines = torch.cat([same, multiply(grid.shape, on_line), wide.index_select(1, cells)])
-    lacking, width = _find_layers(grid, axis)
-    matrices = same, lines, spread(same), around, torch.cat([around, lacking], 1)
-    pairs = [_Pair.of(matrix, dtype, device) for matrix in matrices]
-    return _Shell(*pairs, width.to(device, dtype) / UNEVEN)
-
-
-def _choose(numbers: Tensor, count: int) -> Tensor:
-    """The sparse matrix [N, count] whose rows are 1 at these `numbers` [N]."""
-    height = len(numbers)
-    return _sparse(torch.arange(height), numbers, torch.ones(height).double(), height, count)
-
-
-def _sparse(rows: Tensor, columns: Tensor, weights: Tensor, height: int, width: int) -> Tensor:
-    """The matrix of these entries, of which those in the same place are added."""
-    size = height, width
-    return torch.sparse_coo_tensor(
-        torch.stack([rows, columns]), weights, size, check_invariants=False
+    around = [(places[by_faces[0]], *by_faces[1:]), (places, count + order, ones)]
+    (rows, columns, weights), width = _find_layers(grid, axis)
+    lacking = rows, 2 * count + columns, weights
+    return _Shell(
+        pair(count, grid.cells, same),
+        pair(3 * count, grid.cells, *lines),
+        pair(all_places, grid.cells, (places, same[1], ones)),
+        pair(all_places, 2 * count, *around),
+        pair(all_places, 2 * count + len(width), *around, lacking),
+        width.to(device, dtype) / UNEVEN,
     )
 
 
-def _find_layers(grid: Grid, axis: int | None) -> tuple[Tensor, Tensor]:
+def _find_layers(grid: Grid, axis: int | None) -> tuple[_Entries, Tensor]:
     """What of `lacking` light lacks, with columns of its own; and the width of those cells [u]."""
-    wide = torch.Size(count + 2 for count in grid.shape)
-    place, widths = torch.arange(wide.numel()).view(wide), list[float]()
-    layers = [_choose(torch.zeros(0).long(), wide.numel()).t()]
+    place = torch.arange(math.prod(n + 2 for n in grid.shape)).view([n + 2 for n in grid.shape])
+    none, count = torch.zeros(0, dtype=torch.long), 0
+    layers = [(none, none, none.double(), none.double())]
     for along, side in _faces_of(grid):
         outer, last = (place.select(along, -1 - k if side else k) for k in range(2))
-        rows, columns = grid.shape[:along] + grid.shape[along + 1 :]
-        cells = torch.arange(rows * columns).view(1, rows, columns).double()
-        nearest = pad(cells, [1] * 4, mode="replicate").long()[0]
+        number = count + torch.arange(last[1:-1, 1:-1].numel()).double()
+        sides = [n - 2 for n in outer.shape]
+        nearest = pad(number.view(1, *sides), [1] * 4, mode="replicate")[0].long()
+        count += len(number)
+        rows = torch.cat([outer.flatten(), last[1:-1, 1:-1].flatten()])
+        columns = torch.cat([nearest.flatten(), number.long()])
         # What stands for a face is less by what that lacks, and by what the last cell has more.
         less = -1.0 if along == axis else -2.0 - RAISED
-        weights = [less] * outer.numel() + [RAISED] * cells.numel()
-        pairs = (outer, nearest), (last[1:-1, 1:-1], nearest[1:-1, 1:-1])
-        entries = torch.cat([torch.stack(pair).flatten(1) for pair in pairs], 1)
-        numbers = torch.tensor(weights, dtype=torch.float64)
-        layers.append(_sparse(*entries, numbers, wide.numel(), cells.numel()))
-        widths += [grid.spacing[along]] * cells.numel()
-    return torch.cat(layers, 1), torch.tensor(widths, dtype=torch.float64)
+        weights = torch.cat([number.new_full([outer.numel()], less), 0 * number + RAISED])
+        layers.append((rows, columns, weights, 0 * number + grid.spacing[along]))
+    rows, columns, weights, width = (torch.cat(many) for many in zip(*layers, strict=True))
+    return (rows, columns, weights), width

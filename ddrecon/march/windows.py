@@ -11,9 +11,9 @@ from ddrecon.cameras import Camera, Pane, Rays, cast_rays, subpixel_offsets
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import fill
-from ddrecon.march.box import cross_box
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
+from ddrecon.march.samplers import cross_box
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.optics import reflectance, refract

@@ -10,8 +10,13 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.lighting import fluence
-from ddrecon.medium.coefficients import Volume, mix_media, scale_medium
-from ddrecon.medium.levels import refine_medium, volume_at_level
+from ddrecon.medium.coefficients import (
+    Volume,
+    mix_media,
+    refine_medium,
+    scale_medium,
+    volume_at_level,
+)
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.picture import render
