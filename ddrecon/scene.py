@@ -24,7 +24,7 @@ from ddrecon.light.ground import Ground
 from ddrecon.light.lights import BeamLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 

@@ -20,7 +20,7 @@ from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
 from ddrecon.variables.values import value_of, variable_names, with_values

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
 from ddrecon.reconstruct.metric import find_diagonals

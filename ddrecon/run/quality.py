@@ -23,7 +23,7 @@ from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
-from ddrecon.pictures.scales import COMPARED, LINEAR
+from ddrecon.pictures import COMPARED, LINEAR
 from ddrecon.progress import show_progress
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction

@@ -20,8 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, names_of
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
