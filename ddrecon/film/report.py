@@ -70,8 +70,6 @@ def write_film_report(film: Film) -> Outcome:
     for number in film.done():
         summary = summaries[number] = json.loads((film.of(number) / SUMMARY).read_text())
         row = {key: summary[key] for key in KEYS if summary[key] is not None}
-        registered = summary.get("registered", {})
-        row |= {f"registered_{key}": value for key, value in registered.items()}
         rows.append({"frame": number, **row})
     record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows}
     if values := film.shared.get("values"):
@@ -80,15 +78,8 @@ def write_film_report(film: Film) -> Outcome:
     if not rows:
         return record, ["no frame is done"]
     means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
-    registered = {
-        key.removeprefix("registered_"): value
-        for key, value in means.items()
-        if key.startswith("registered_")
-    }
-    lead = (
-        f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: "
-        f"{psnr_text({**means, 'registered': registered})}"
-    )
+    count_text = f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each"
+    lead = f"{count_text}: {psnr_text(means)}"
     numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
     write_page(
         film.path / REPORT,
@@ -104,7 +95,7 @@ def write_film_report(film: Film) -> Outcome:
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> list[Plot]:
-    drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
+    drawn, kinds = [], {"trained on": "", "held out": "test_"}
     for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
         series = {
             name: [(float(row["frame"]), row[kind + key]) for row in rows if kind + key in row]
