@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,17 +47,6 @@ class Pair:
     def white(self) -> float:
         """The value shown brightest."""
         return max(float(np.quantile(self.ours if self.truth is None else self.truth, 0.999)), 1e-6)
-
-
-def ddrecon(*arguments: str | Path) -> None:
-    """Runs a command, quietly."""
-    command = ["ddrecon", *arguments, "-q", "--overwrite"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-def as_options(overrides: Sequence[str]) -> list[str]:
-    """`overrides` as a command takes them."""
-    return [part for override in overrides for part in ("-D", override)]
 
 
 def read_log(run: Path) -> Log:
