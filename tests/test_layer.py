@@ -220,11 +220,7 @@ MIRRORED = torch.tensor([-1.0, 1, 1]).double().diag()[:, [0, 1, 2, 2]]
 RECORDS: dict[str, list[Any]] = {
     "lights": [[SUN], [None]],
     "views": [[None]],
-    "ground": [
-        Ground(torch.ones(1, 2, 3), Plane(-9.0, 1)),
-        Ground(tensor(0.5), Plane(NAN, 1)),
-        Ground(tensor(0.5), Plane(-9.0, 7)),
-    ],
+    "ground": [Ground(tensor(0.5), Plane(NAN, 1)), Ground(tensor(0.5), Plane(-9.0, 7))],
     "diffusion": [{}],
     "volume.phase": [None],
     "volume.black_body": [2000.0],

@@ -388,8 +388,6 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     if density.is_meta:
         raise UsageError("density: has no numbers on the device meta")
     require_shape("volume.support", scene.volume.support, cells)
-    if scene.ground is not None:
-        require_shape("ground.albedo", scene.ground.albedo, (1,), (3,))
     for item in views:
         _require_view(item)
     for name, value in _numbers_of(scene, views).items():
