@@ -7,7 +7,6 @@ tracing by Mitsuba 3, where that is installed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from ddrecon.errors import SolveError
 from ddrecon.picture import render_each
 from ddrecon.progress import Progress, table_lines
 from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
+from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import plume_scene, relative_error
 from ddrecon.variables.values import with_values
@@ -38,7 +37,7 @@ TRUTH_PASSES, TRUTH_SEED = 4, 1000
 QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 HEAD: tuple[str, ...] = ("variant", "image s", "+ gradient s", "times base", "iterations")
-HEAD += ("image num. error", "gradient num. error", "image error", "")
+HEAD += ("image num. error", "gradient num. error", "image error")
 
 
 @dataclass(frozen=True)
@@ -142,8 +141,7 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. `is_best`: no
-    other row is known to be faster and as close to the truth.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
@@ -164,7 +162,6 @@ def run_bench(
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
-    mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
     return {
         "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
@@ -208,22 +205,6 @@ def row_of(
     }
 
 
-def mark_best(rows: list[dict[str, Any]], noise: float) -> None:
-    """Marks the `rows` that no other beats in both time of an image and error.
-
-    An error against path tracing is at least what the `noise` of that can tell from none.
-    """
-
-    def error(row: dict[str, Any]) -> float:
-        if row["image_error"] is not None:
-            return max(row["image_error"], least_error(noise))
-        return math.inf if row["image_numerical"] is None else row["image_numerical"]
-
-    for row in rows:
-        faster = (other for other in rows if other["image_seconds"] < row["image_seconds"])
-        row["is_best"] = all(error(other) > error(row) for other in faster)
-
-
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """The report as a Markdown table, and Mitsuba's time; times are multiples of the base's."""
     rows, noise, cells = report["rows"], report["truth_noise"], list[list[str]]()
@@ -234,7 +215,6 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
         cells.append([row["name"], *(f"{n:.3f}" for n in seconds), times, str(row["iterations"])])
         cells[-1] += ["" if error is None else f"{error:.1e}" for error in numerical]
         cells[-1] += ["" if noise is None else error_text(row["image_error"], noise)]
-        cells[-1] += ["best" if row["is_best"] else ""]
     lines = table_lines(HEAD, cells)
     if noise is not None:
         times = rows[-1]["image_seconds"] / rows[0]["image_seconds"]
