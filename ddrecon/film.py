@@ -41,7 +41,7 @@ from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.progress import say
 from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
@@ -556,7 +556,7 @@ def _figures(
             image = shrink(torch.from_numpy(stored).permute(2, 0, 1), WIDEST)
             psnr = summaries[number]["views"][name]["psnr"]
             caption = f"{name}, frame {number}: {psnr:.2f} dB"
-            strip.append((webp_of(srgb.encode_bytes(pixels(image))), caption))
+            strip.append((webp_of(encode_bytes(pixels(image))), caption))
     return strips
 
 

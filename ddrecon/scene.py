@@ -24,7 +24,7 @@ from ddrecon.light.ground import Ground
 from ddrecon.light.lights import BeamLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
@@ -97,7 +97,7 @@ class Scene:
         media = [*volume.media.values()] if volume.media else [volume]
         with torch.no_grad():
             if self.ground is not None and self.occupied is None:
-                self.occupied = find_occupied(volume, media, optimized)
+                self.occupied = find_occupied(volume, media, self.ground, optimized)
             self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
             if self.render.steps_per_voxel is None:
                 steps = choose_steps(volume, self.diffusion.times)
@@ -170,6 +170,8 @@ def _unrepeated(scene: Scene) -> Iterator[str]:
         axis = scene.ground.plane.axis
         if axis in scene.volume.grid.periodic:
             yield f"ground: lies across {'zyx'[axis]}, along which the volume is periodic"
+        if scene.ground.albedo.ndim > 1:
+            yield "ground.albedo: a map does not repeat as the volume does: give a number"
     if scene.volume.index != 1:
         yield "volume.index: faces that repeat refract nothing: leave index or periodic out"
     for name, parameter in scene.optimize.parameters.items() if scene.optimize else ():

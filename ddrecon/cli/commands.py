@@ -302,11 +302,11 @@ def uncertainty(session: Session, source: Path, experiments: int) -> None:
 def gradcheck(session: Session, source: Path, parameters: tuple[str, ...], samples: int) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
     scene = session.load(source)
-    from ddrecon.validate.gradcheck import check_parameters, describe, table
+    from ddrecon.validate.gradcheck import check_parameters, lines
 
-    checks = check_parameters(scene, parameters, samples, session.seed, session.progress)
-    session.show(describe(checks), table(checks))
-    if not all(check.has_passed for check in checks):
+    report = check_parameters(scene, parameters, samples, session.seed, session.progress)
+    session.show(report, lines(report))
+    if not report["passed"]:
         sys.exit(1)
 
 

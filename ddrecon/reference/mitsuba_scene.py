@@ -24,9 +24,9 @@ from torch.nn.functional import interpolate
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.light.environment import rotate_directions
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.sky import rotate_directions
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Mixture, PhaseFunction, Rayleigh
 from ddrecon.scene import Scene, View
@@ -101,7 +101,7 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
             "interior": {"type": "ref", "id": MEDIUM},
         },
         **mitsuba_lights(scene.lights),
-        **({"ground": _ground(scene.ground, grid)} if scene.ground else {}),
+        **(_ground(scene.ground, grid) if scene.ground else {}),
     }
 
 
@@ -188,8 +188,7 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
         weight = complement.item() if phase.cells is None else _grid_volume(complement, grid)
         return {"type": "blendphase", "weight": weight, "first": first, "second": second}
     cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
-    numbers = (number.detach().cpu().double() for number in phase.numbers)
-    values = phase.kind(*numbers).value(cosines)
+    values = phase.map(lambda number: number.detach().cpu().double()).value(cosines)
     return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
 
 
@@ -212,19 +211,35 @@ def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _ground(ground: Ground, grid: Grid) -> dict[str, Any]:
-    """A square in place of the unbounded plane, a little below the box.
+def _ground(ground: Ground, grid: Grid) -> dict[str, dict[str, Any]]:
+    """A square in place of the unbounded plane, and one under the box for a map of albedo.
 
-    Mitsuba's runs from -1 to 1 across +z.
+    Mitsuba's runs from -1 to 1 across +z. They lie a little below the box, and the map above the
+    other square: of two surfaces in the same place rays meet either.
     """
-    up, size = 2 - ground.plane.axis, math.hypot(*grid.extent)
-    place = np.zeros((4, 4))
-    for column, axis in enumerate(((up + 1) % 3, (up + 2) % 3, up)):
-        place[axis, column] = FAR * size
-    place[:, 3] = [*grid.center_xyz, 1.0]
-    place[up, 3] = min(ground.plane.height, grid.lower[ground.plane.axis] - NEAR * size)
-    bsdf = {"type": "diffuse", "reflectance": _color(ground.albedo)}
-    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+    up, gap = 2 - ground.plane.axis, NEAR * math.hypot(*grid.extent)
+    height = min(ground.plane.height, grid.lower[ground.plane.axis] - gap)
+
+    def square(halves: Sequence[float], height: float, reflectance: Any) -> dict[str, Any]:
+        place, middle = np.zeros((4, 4)), np.array([*grid.center_xyz, 1.0])
+        middle[up] = height
+        for column, axis in enumerate(((up + 1) % 3, (up + 2) % 3, up)):
+            place[axis, column] = halves[axis]
+        place[:, 3] = middle
+        bsdf = {"type": "diffuse", "reflectance": reflectance}
+        return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+    is_map = ground.albedo.ndim > 1
+    wide = 3 * [FAR * gap / NEAR], height - is_map * gap, _color(ground.mean_albedo)
+    squares = {"ground": square(*wide)}
+    if is_map:
+        # A picture's rows run along the square's second axis.
+        pixels = ground.albedo.detach().cpu().permute((2, 1, 0) if up == 1 else (1, 2, 0))
+        picture = np.ascontiguousarray(pixels.expand(-1, -1, 3), np.float32)
+        texture = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
+        halves = [side / 2 for side in grid.extent[::-1]]
+        squares["ground_map"] = square(halves, height, texture)
+    return squares
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
@@ -307,7 +322,7 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:
-    """The map turned as `ddrecon.light.environment` says, which holds `ambient` [3] as well."""
+    """The map turned as `ddrecon.light.sky` says, which holds `ambient` [3] as well."""
     radiance = (light.scale * light.radiance).detach().cpu().double().numpy()
     pixels = np.broadcast_to(radiance.transpose(1, 2, 0), (*radiance.shape[1:], 3)) + ambient
     turn = np.eye(4)

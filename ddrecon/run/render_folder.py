@@ -30,9 +30,9 @@ from ddrecon.io.images.table import (
 from ddrecon.light_field import LightField, fluence_of
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
-from ddrecon.medium.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.picture import view_components, view_matte, view_picture
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.progress import show_progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
@@ -243,7 +243,7 @@ def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) ->
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
     exposed = [image / white for image in images]
-    MOVIES[path.suffix.lower()](path, [srgb.encode_bytes(image) for image in exposed], fps)
+    MOVIES[path.suffix.lower()](path, [encode_bytes(image) for image in exposed], fps)
     for view, image in zip(views, exposed, strict=True):
         write_preview(folder / f"{view.name}.png", image)
     return white

@@ -40,6 +40,7 @@ from ddrecon.scene_file.schema import (
     BeamSection,
     DirectionalSection,
     EnvironmentSection,
+    GroundSection,
     LightSection,
     PointSection,
 )
@@ -149,9 +150,9 @@ def _build_parts(
         with problems.collecting():
             lights.append(_build_light(maker, f"lights.{index}.", section))
     ground = None
-    if tree.ground is not None:
-        plane = Plane(tree.ground.height, "zyx".index(tree.volume.up))
-        ground = Ground(maker.color("ground.albedo", tree.ground.albedo), plane)
+    if media and tree.ground is not None:
+        with problems.collecting():
+            ground = _build_ground(maker, tree.ground)
     for name, settings in tree.optimize.parameters.items() if tree.optimize else ():
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
@@ -170,11 +171,34 @@ def _build_light(maker: Maker, owner: str, section: LightSection) -> Light:
         }
         return LIGHTS[type(section)](**numbers)
     pixels = read_referenced(maker.scene_file, f"{owner}file", section.file, _read_map)
-    if not maker.tree.may_change(f"{owner}radiance") and (pixels == pixels[..., :1]).all():
-        pixels = pixels[..., :1]
-    radiance = maker.picture(pixels)
+    radiance = _map_of(maker, f"{owner}radiance", pixels)
     scale, rotation = maker.tensor(section.scale), maker.tensor(section.rotation)
     return EnvironmentLight(radiance, scale, rotation, section.directions, section.up)
+
+
+def _map_of(maker: Maker, name: str, pixels: np.ndarray) -> Tensor:
+    """The variable `name` [C, h, w] of `pixels` [h, w, 3]; gray unless that may change."""
+    if not maker.tree.may_change(name) and bool((pixels == pixels[..., :1]).all()):
+        pixels = pixels[..., :1]
+    return maker.picture(pixels)
+
+
+def _build_ground(maker: Maker, section: GroundSection) -> Ground:
+    name, albedo = "ground.albedo", section.albedo
+    if isinstance(albedo, FieldFile):
+        pixels = read_referenced(maker.scene_file, f"{name}.file", albedo.file, _read_albedo)
+        reflected = _map_of(maker, name, pixels)
+    else:
+        reflected = maker.color(name, albedo)
+    return Ground(reflected, Plane(section.height, "zyx".index(maker.tree.volume.up)))
+
+
+def _read_albedo(path: Path) -> np.ndarray:
+    pixels = read_image(path).pixels
+    if pixels.min() < 0 or pixels.max() > 1:
+        ends = f"{pixels.min():.3g} to {pixels.max():.3g}"
+        raise FormatError(path, f"has values from {ends}; an albedo is from 0 to 1")
+    return pixels
 
 
 def _read_map(path: Path) -> np.ndarray:

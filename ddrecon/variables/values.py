@@ -164,6 +164,13 @@ def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict
     return named
 
 
+def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
+    """Those that the variable `name` of `scene` may have; raises as `value_of`."""
+    is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
+    shape = () if is_pair else tuple(value_of(scene, name).shape)
+    return shapes_in_place(name, shape, scene.volume.grid.shape)
+
+
 def shapes_in_place(
     name: str, shape: tuple[int, ...], cells: tuple[int, ...]
 ) -> list[tuple[int, ...]]:
@@ -385,8 +392,6 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     if density.is_meta:
         raise UsageError("density: has no numbers on the device meta")
     require_shape("volume.support", scene.volume.support, cells)
-    if scene.ground is not None:
-        require_shape("ground.albedo", scene.ground.albedo, (1,), (3,))
     for item in views:
         _require_view(item)
     for name, value in _numbers_of(scene, views).items():
