@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -124,7 +124,7 @@ def show(axis: Any, values: Array | None, white: float, colors: str = "viridis")
     if values is None:
         axis.axis("off")
     elif values.ndim == 3:
-        axis.imshow(srgb.encode(np.clip(values / white, 0, 1)))
+        axis.imshow(encode(np.clip(values / white, 0, 1)))
     else:
         axis.imshow(values, cmap=colors, vmin=0, vmax=white)
 

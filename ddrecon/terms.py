@@ -20,9 +20,14 @@ from ddrecon.light.lights import (
 from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.light_field import multiply_scatters
 from ddrecon.march.samplers import greatest_depth
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.coefficients import (
+    Medium,
+    Volume,
+    backward_fraction,
+    has_backward_peak,
+    scale_medium,
+)
 from ddrecon.medium.optics import transmitted_moments
-from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings

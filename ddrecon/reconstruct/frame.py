@@ -13,15 +13,13 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
 from ddrecon.reconstruct.metric import find_diagonals
 from ddrecon.reconstruct.numbers import Point
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
-from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.recording import Replays
-from ddrecon.reconstruct.search import Objective
 from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
@@ -74,12 +72,16 @@ class Result:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A frame's `objective`, by names of parameters, and the images that were `compared` for it.
+    """What a frame adds to the objective, and the images that were `compared` for it.
 
-    The objective is relative to the mean square of the targets; `psnr` [dB] is the images' mean.
+    These are the `loss` of images and the `prior`, with their derivatives by name, relative to the
+    mean square of the targets; `psnr` [dB] is the images' mean.
     """
 
-    objective: Objective
+    loss: float
+    prior: float
+    gradients: Mapping[str, Tensor]
+    prior_gradients: Mapping[str, Tensor]
     psnr: float
     compared: Comparison
 
@@ -129,7 +131,7 @@ class Frame:
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
         bars = {name: bar for name, (_, bar) in priors.items()}
-        return Evaluation(Objective(of_images / unit, prior, relative, bars), psnr, compared)
+        return Evaluation(of_images / unit, prior, relative, bars, psnr, compared)
 
     def noise_loss(self) -> float:
         """The loss of perfect images: that of the pictures' noise and of the model's own error."""
@@ -147,16 +149,15 @@ class Frame:
             total += view.weight / weights * float(loss)
         return total / self.problem.unit
 
-    def find_diagonals(
-        self, parameters: Sequence[Parameter], compared: Comparison
-    ) -> dict[str, Tensor]:
-        """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
-        point, memory = self.point(compared), self.memory
+    def find_diagonals(self, names: Sequence[str], compared: Comparison) -> dict[str, Tensor]:
+        """The diagonal of the objective's Gauss-Newton matrix, by the parameters called `names`."""
+        memory = self.memory
         # Random pictures need no exact light, and their adjoint is near to no other.
         inexact = SolveMemory(
             memory.is_warm, dict(memory.last), memory.records, solve_tolerances(1.0)
         )
-        return find_diagonals(point.scene, parameters, point.values, point.weights, inexact)
+        parameters = [p for p in self.parameters if p.name in names]
+        return find_diagonals(self.point(compared), parameters, inexact)
 
     def point(self, compared: Comparison) -> Point:
         """Where the parameters stand, with how strongly the pixels `compared` count."""
@@ -181,7 +182,8 @@ class Frame:
 
         Of a candidate that was refused it has what the volume before it came to.
         """
-        objective, unit, counts = evaluation.objective, self.problem.unit, Counter[str]()
+        loss, prior = evaluation.loss, weight * evaluation.prior
+        unit, counts = self.problem.unit, Counter[str]()
         for record in self.memory.records:
             counts[record.kind] += record.iterations
         quality = dict[str, float]()
@@ -194,9 +196,9 @@ class Frame:
         row = Row(
             iteration=self.total.iteration + 1,
             seconds=self.total.seconds + seconds,
-            loss=objective.total(weight) * unit,
-            data_loss=objective.loss * unit,
-            penalty=objective.prior * weight * unit,
+            loss=(loss + prior) * unit,
+            data_loss=loss * unit,
+            penalty=prior * unit,
             psnr=evaluation.psnr,
             forward_iterations=counts["forward"],
             adjoint_iterations=counts["adjoint"],
@@ -227,16 +229,13 @@ class Frame:
             "misfit": self.misfit,
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up the parameters and the log of `state`."""
+    def restore(self, state: Mapping[str, Any], level: int) -> None:
+        """Takes up the `state` of a frame that was at a `level` of resolution."""
         for p in self.parameters:
             p.restore(state["parameters"][p.name])
+        self.enter(level)
         self.total, self.misfit = Row(**state["total"]), state["misfit"]
-
-    def restore_solutions(self, state: Mapping[str, Any]) -> None:
-        """Takes up what solves begin from, at the resolution of `state`."""
-        like = self.problem.scene.volume.density
-        self.memory.last |= {kind: u.to(like) for kind, u in state["solutions"].items()}
+        self.memory.last = dict(state["solutions"])
         # By which iterations are recorded on a GPU.
         self.memory.iterations = dict(state["iterations"])
 

@@ -8,7 +8,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from ddrecon.cameras import CELL, cell_width
 from ddrecon.grid import Grid
-from ddrecon.medium.levels import resample, volume_at_level
+from ddrecon.medium.coefficients import resample, volume_at_level
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 

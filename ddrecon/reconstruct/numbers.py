@@ -12,7 +12,7 @@ is half the light; all cameras moved together move the volume.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -54,17 +54,20 @@ class Point:
 class Numbers:
     """The single numbers among `parameters`, which the views of `train` and scenes like it show.
 
-    `matrix` is J^T W J between all entries, one after another, with what the calibrations of
-    cameras say; `prior` is the latter alone. Both are 0 until `prepare` was called.
+    They are the last `size` entries of vectors, and `places` tells where each stands among them.
+    `matrix` is J^T W J between all of them, with what the calibrations of cameras say; `prior` is
+    the latter alone. Both are 0 until `prepare` was called.
     """
 
     def __init__(self, train: Scene, parameters: Sequence[Parameter]):
-        self.numbers = single_numbers(parameters)
-        self.places = _places(self.numbers)
-        size = sum(p.value.numel() for p in self.numbers)
-        self.matrix = self.prior = torch.zeros(size, size).double()
-        self.gauges = find_gauges(train, self.numbers)
-        poses = [p for p in self.numbers if p.key == "camera"]
+        numbers = single_numbers(parameters)
+        self.places = _places(numbers)
+        self.size = sum(p.value.numel() for p in numbers)
+        self.matrix = self.prior = torch.zeros(self.size, self.size).double()
+        self.gauges = find_gauges(train, numbers)
+        bounds = ((p.low, p.high) for p in numbers for _ in range(p.value.numel()))
+        self.bounds = torch.tensor([*bounds]).double().view(-1, 2)
+        poses = [p for p in numbers if p.key == "camera"]
         # Where some cameras are optimized no calibration is to be mended: they may be far off.
         cameras = {view.name: view.camera for view in train.views}
         calibrated = poses if len(poses) == len(cameras) > 1 else []
@@ -74,7 +77,7 @@ class Numbers:
 
     def prepare(self, points: Sequence[Point]) -> None:
         """Takes the metric at `points`, one for each scene."""
-        matrix = torch.stack([find_matrix(point, self.numbers) for point in points]).sum(0)
+        matrix = torch.stack([find_matrix(point, [*self.places]) for point in points]).sum(0)
         prior = torch.zeros_like(matrix)
         for p, precision in self.precisions.items():
             # As strong as what one picture says of a shift in the image by `TRUST` pixels.
@@ -86,61 +89,62 @@ class Numbers:
         # As the first rank has it: another machine may round in another way.
         self.matrix, self.prior = from_first(matrix + prior), from_first(prior)
 
-    def penalty(self, values: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
-        """What calibrations add to the objective at `values`, and its derivatives by name."""
+    def penalty(self, values: Tensor) -> tuple[float, Tensor]:
+        """What calibrations add to the objective at `values` [n], and its derivative [n]."""
+        slope = torch.zeros_like(values)
         if not self.precisions:
-            return 0.0, {}
-        vector = self._join(values)
-        slope = self.prior @ vector
-        return float(vector @ slope) / 2, self._split(slope, values)
+            return 0.0, slope
+        twists = self._take(values)
+        product = self.prior @ twists
+        slope[-self.size :] = product.to(slope)
+        return float(twists @ product) / 2, slope
 
-    def precondition(
-        self, residual: Mapping[str, Tensor], free: Mapping[str, Tensor]
-    ) -> dict[str, Tensor]:
-        """The inverse of the matrix times `residual`, of what is `free` and of no gauge."""
-        if not self.numbers:
-            return {}
-        at = self._join(free).nonzero()[:, 0]
-        result = torch.zeros(len(self.matrix)).double()
+    def precondition(self, values: Tensor, free: Tensor, vectors: Tensor) -> Tensor:
+        """The inverse of the matrix times `vectors` [m, n], of what is `free` [n] and no gauge.
+
+        Gauges are those at `values` [n].
+        """
+        result = torch.zeros(len(vectors), self.size).double()
+        at = self._take(free).nonzero()[:, 0]
         if len(at):
-            result[at] = from_first(self._solve(self._join(residual)[at], at))
-        return self._split(result, residual)
+            right = self._take(vectors)[:, at].T
+            result[:, at] = from_first(self._solve(self._take(values), at, right)).T
+        return result.to(vectors)
 
-    def hold_gauges(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """`values` without what gauges forbid."""
-        held = dict(values)
+    def hold_gauges(self, values: Tensor) -> Tensor:
+        """`values` [n] without what gauges forbid."""
+        if not self.gauges:
+            return values
+        numbers = self._take(values)
         for gauge in self.gauges:
-            held |= gauge.hold(held)
-        return held
+            gauge.hold(numbers)
+        numbers = numbers.clamp(*self.bounds.T)
+        return torch.cat([values[: -self.size], numbers.to(values)])
 
-    def _solve(self, right: Tensor, at: Tensor) -> Tensor:
-        """The solution of the rows and columns `at` of the matrix, within the gauges."""
+    def _take(self, vector: Tensor) -> Tensor:
+        """The numbers in a `vector` [..., n], in float64."""
+        return vector[..., vector.shape[-1] - self.size :].detach().double().cpu()
+
+    def _solve(self, numbers: Tensor, at: Tensor, right: Tensor) -> Tensor:
+        """The solutions of the rows and columns `at` of the matrix, within gauges at `numbers`."""
         matrix = self.matrix[at[:, None], at]
-        least = torch.zeros(len(self.matrix)).double()
+        least = torch.zeros(self.size).double()
         for place in self.places.values():
             diagonal = self.matrix.diagonal()[place]
             least[place] = tuning.LEAST * diagonal.max() + torch.finfo(torch.float32).tiny
         matrix = matrix + least[at].diag() + tuning.DAMPING * matrix.diagonal().diag()
         # In units of their own curvature, numbers are of one size.
-        unit = matrix.diagonal().rsqrt()
+        unit = matrix.diagonal().rsqrt()[:, None]
         basis = torch.eye(len(at)).double()
-        if directions := [gauge.directions_in(self.places, len(least)) for gauge in self.gauges]:
-            forbidden = torch.cat(directions, 1)[at] * unit[:, None]
+        if self.gauges:
+            slopes = [gauge.slopes(numbers) for gauge in self.gauges]
+            forbidden = torch.cat(slopes, 1)[at] * unit
             # What is orthogonal to the directions: the last columns of a complete basis.
             rank = int(torch.linalg.matrix_rank(forbidden))
             basis = torch.linalg.svd(forbidden)[0][:, rank:]
-        scaled = basis.T @ (matrix * unit * unit[:, None]) @ basis
+        scaled = basis.T @ (matrix * unit * unit.T) @ basis
         solution: Tensor = basis @ torch.linalg.solve(scaled, basis.T @ (right * unit)) * unit
         return solution
-
-    def _join(self, tensors: Mapping[str, Tensor]) -> Tensor:
-        """Entries of all numbers one after another, in float64."""
-        return torch.cat([tensors[p.name].detach().flatten().double().cpu() for p in self.numbers])
-
-    def _split(self, vector: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {
-            p.name: vector[at].view(p.value.shape).to(like[p.name]) for p, at in self.places.items()
-        }
 
 
 def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
@@ -215,62 +219,54 @@ def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
 
 
 class Gauge:
-    """`parameters` whose changes from the values they have now have no part in `directions` [n, k].
+    """The numbers `at` [m] some places, whose changes have no part in `directions` [m, k].
 
-    The directions are of all entries one after another, and made orthonormal. With `is_relative`,
-    changes are those of logarithms.
+    They change from their `values` [m] now; the directions are made orthonormal. With
+    `is_relative`, changes are those of logarithms.
     """
 
-    def __init__(self, parameters: Sequence[Parameter], directions: Tensor, is_relative: bool):
-        self.parameters, self.is_relative = parameters, is_relative
-        values = {p.name: p.value.detach() for p in parameters}
-        self.directions, self.start = torch.linalg.qr(directions)[0], self._join(values)
+    def __init__(self, at: Tensor, values: Tensor, directions: Tensor, is_relative: bool):
+        self.at, self.is_relative = at, is_relative
+        self.directions = torch.linalg.qr(directions.double().cpu())[0]
+        values = values.double().cpu()
+        self.start = values.log() if is_relative else values
 
-    def hold(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The `values` of its parameters without what lies in the directions."""
-        vector = self._join(values)
-        vector = vector - self.directions @ (self.directions.T @ (vector - self.start))
-        vector = vector.exp() if self.is_relative else vector
-        chunks = vector.split([p.value.numel() for p in self.parameters])
-        return {
-            p.name: chunk.view(p.value.shape).clamp(p.low, p.high)
-            for p, chunk in zip(self.parameters, chunks, strict=True)
-        }
+    def hold(self, numbers: Tensor) -> None:
+        """Takes what lies in the directions from all `numbers` [n]."""
+        values = numbers[self.at]
+        values = values.log() if self.is_relative else values
+        values = values - self.directions @ (self.directions.T @ (values - self.start))
+        numbers[self.at] = values.exp() if self.is_relative else values
 
-    def directions_in(self, places: Mapping[Parameter, Tensor], size: int) -> Tensor:
-        """The slopes [size, k] of what is held by all numbers, which stand at `places`."""
-        slopes = self.directions.double().cpu()
-        if self.is_relative:
-            values = [p.value.detach().flatten() for p in self.parameters]
-            slopes = slopes / torch.cat(values).double().cpu()[:, None]
-        directions = torch.zeros(size, slopes.shape[1]).double()
-        directions[torch.cat([places[p] for p in self.parameters])] = slopes
-        return directions
-
-    def _join(self, values: Mapping[str, Tensor]) -> Tensor:
-        vector = torch.cat([values[p.name].flatten() for p in self.parameters])
-        return vector.log() if self.is_relative else vector
+    def slopes(self, numbers: Tensor) -> Tensor:
+        """The directions at all `numbers` [n], by each of them: [n, k]."""
+        slopes = torch.zeros(len(numbers), self.directions.shape[1]).double()
+        unit = numbers[self.at, None] if self.is_relative else 1.0
+        slopes[self.at] = self.directions / unit
+        return slopes
 
 
-def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
-    """The gauges of `parameters`, where those of every training view of several are among them."""
-    by_name = {parameter.name: parameter for parameter in parameters}
+def find_gauges(train: Scene, numbers: Sequence[Parameter]) -> list[Gauge]:
+    """The gauges of all `numbers`, where those of every training view of several are among them."""
+    by_name, places = {p.name: p for p in numbers}, _places(numbers)
     gauges, views = list[Gauge](), train.views
 
-    def of_all(key: str) -> list[Parameter]:
+    def add(key: str, directions: Callable[[list[Parameter]], Tensor], is_relative: bool) -> None:
         chosen = [by_name.get(f"views.{view.name}.{key}") for view in views]
-        present = [parameter for parameter in chosen if parameter is not None]
-        return present if len(present) == len(views) > 1 else []
+        present = [p for p in chosen if p is not None]
+        if len(present) == len(views) > 1:
+            at = torch.cat([places[p] for p in present])
+            values = torch.cat([p.value.detach().flatten() for p in present])
+            gauges.append(Gauge(at, values, directions(present), is_relative))
 
-    if exposures := of_all("exposure"):
-        # The same gain of all, of each color by itself where all have three.
-        sizes, like = [p.value.numel() for p in exposures], exposures[0].value.detach()
+    def gain(exposures: list[Parameter]) -> Tensor:
+        """The same of all, of each color by itself where all have three."""
+        sizes = [p.value.numel() for p in exposures]
         colors = sizes[0] if len(set(sizes)) == 1 else 1
-        gain = torch.eye(colors).to(like).repeat(sum(sizes) // colors, 1)
-        gauges.append(Gauge(exposures, gain, is_relative=True))
-    if cameras := of_all("camera"):
-        directions = torch.cat([_common_motion(view, train) for view in views])
-        gauges.append(Gauge(cameras, directions, is_relative=False))
+        return torch.eye(colors).repeat(sum(sizes) // colors, 1)
+
+    add("exposure", gain, is_relative=True)
+    add("camera", lambda _: torch.cat([_common_motion(v, train) for v in views]), is_relative=False)
     return gauges
 
 

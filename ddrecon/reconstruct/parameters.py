@@ -174,4 +174,4 @@ class Parameter:
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = replace(self.grid, shape=tuple(state["shape"]))
-        self.value = state["value"].to(self.value).clone().requires_grad_()
+        self.value = state["value"].clone().requires_grad_()

@@ -10,7 +10,7 @@ import torch
 from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
-from ddrecon.pictures.noise import Noise, estimate_noise
+from ddrecon.pictures import Noise, estimate_noise
 from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.reconstruct.objective import describe_flaw, target_of
 from ddrecon.reconstruct.parameters import Parameter

@@ -16,7 +16,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
-from ddrecon.pictures.scales import COMPARED, LINEAR
+from ddrecon.pictures import COMPARED, LINEAR
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes, target_of
 from ddrecon.reconstruct.setup import choose_loss, targets_of

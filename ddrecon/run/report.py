@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -170,7 +170,7 @@ def _describe_views(findings: Findings) -> dict[str, Any]:
     groups: dict[str, list[tuple[bytes, bytes, str]]] = {"Held out": [], "Trained on": []}
     for view in shown:
         target, render = (
-            webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
+            webp_of(encode_bytes(pixels(shrink(image, most)) / white))
             for image in (target_of(view), findings.images[view.name])
         )
         caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"

@@ -57,8 +57,8 @@ def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
 
     def evaluate(*views: View) -> tuple[float, torch.Tensor]:
         run = Reconstruction(replace(ball_scene, views=[*views]), 1)
-        objective = run.frames[0].evaluate().objective
-        return objective.loss, objective.gradients["density"]
+        evaluation = run.frames[0].evaluate()
+        return evaluation.loss, evaluation.gradients["density"]
 
     heavy = evaluate(replace(first, weight=6.0), replace(second, weight=3.0))
     twice, once = evaluate(first, replace(first, name="again"), second), evaluate(first, second)
@@ -118,7 +118,7 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(
 ) -> None:
     run, failed = Reconstruction(ball_scene), list[str]()
     run.step()
-    candidate, evaluate = run.search.candidate["density"], Frame.evaluate
+    candidate, evaluate = run.search.candidate, Frame.evaluate
 
     def fail_once(frame: Frame) -> Evaluation:
         if not failed:
@@ -129,7 +129,7 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(
     monkeypatch.setattr(Frame, "evaluate", fail_once)
     row = run.step()
     assert row.iteration == 2 and failed
-    torch.testing.assert_close(run.parameters[0].value.detach(), candidate / 2)
+    torch.testing.assert_close(run.parameters[0].value.detach().flatten(), candidate / 2)
 
 
 def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene: Scene) -> None:
