@@ -32,8 +32,8 @@ from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.report.page import write_page
+from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import Job, Outcome
-from ddrecon.run.report import describe_fields
 from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of, split_name
@@ -219,12 +219,13 @@ class Uncertainty(Job):
         }
         first = next(iter(volumes), "density")
         volumes = {name: value.cpu() for name, value in fields_of(scene).items()} | volumes
-        cells = [(name, "result", value, None) for name, value in volumes.items()]
+        cells = [Shown(name, "result", value) for name, value in volumes.items()]
+        world = describe_world(scene.volume.grid, scene)
         write_page(
             path / "report.html",
             title=f"ddrecon: how sure a run is ({path.absolute().name})",
             lead=f"{lead}.",
-            volume=describe_fields(scene, cells, lines, first),
+            volume=describe_volume(cells, world, lines, first),
             numbers={"heading": "Numbers", "head": ("", ""), "rows": rows, "text": ASSUMED},
         )
         return record, [lead, *lines, *(f"{name}: {text}" for name, text in rows), ASSUMED]
