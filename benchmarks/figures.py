@@ -236,7 +236,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
-    parser.add_argument("--show", choices=[*COMMANDS])
+    parser.add_argument("--show", choices=sorted({*COMMANDS, *read_store()}))
     given = parser.parse_args()
     if given.show:
         print(show(given.show, read_store()))

@@ -388,8 +388,8 @@ def _bench_speed(
 
 @command("SCENE | VOLUME...", "file overwrite up", common="overrides debug")
 def export(session: Session, source: tuple[Path, ...], file: Path, up: str | None) -> None:
-    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), or all fields of SCENE, or
-    of VOLUMEs, in the format of FILE's suffix.
+    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
+    NeRF's transforms.json), or all fields of SCENE, or of VOLUMEs, in the format of FILE's suffix.
 
     SCENE is a scene file or the folder of a finished run; a folder of `ddrecon uncertainty` counts
     as its volumes.
@@ -404,11 +404,12 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
         require_no_film(path, f"; `ddrecon {sequence}` writes the volumes of all")
     from ddrecon.io.volumes.table import WRITTEN, read_together, turn_up, write_fields
 
-    kind, suffixes = file.suffix.lower(), (".xml", *WRITTEN)
+    kind, suffixes = file.suffix.lower(), (".xml", ".json", *WRITTEN)
     if kind not in suffixes:
         raise UsageError(f"-o {file}: unknown format {kind!r}; known: {', '.join(suffixes)}")
     from ddrecon.reference.exchange import export_scene
     from ddrecon.run.run_folder import LENGTHS, fields_to_export
+    from ddrecon.scene_file.camera_files import export_transforms
     from ddrecon.uncertainty.experiments import volumes_in
 
     volumes = tuple(volume for path in source for volume in volumes_in(path) or [path])
@@ -425,6 +426,8 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
         scene, upright = session.build(scene_file), scene_file.tree.volume.up
     if kind == ".xml":
         written = export_scene(scene, file, may_exist=may_exist)
+    elif kind == ".json" and scene_file is not None:
+        written = export_transforms(scene, scene_file, file, may_exist=may_exist)
     else:
         written = [file]
         if is_of_scene:

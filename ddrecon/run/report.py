@@ -125,6 +125,8 @@ def psnr_text(summary: Mapping[str, Any]) -> str:
     text = f"PSNR {summary['psnr']:.2f} dB"
     if summary.get("test_psnr") is not None:
         text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    if registered := summary.get("registered"):
+        text += f" (registered {_registered_text(registered)})"
     return text
 
 
@@ -180,4 +182,11 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
         if f"fitted_{key}" in quality:
             values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
             text += f", {key} {values} fitted to it"
-    return text
+    registered = quality.get("registered")
+    return text + (f"; registered {_registered_text(registered)}" if registered else "")
+
+
+def _registered_text(registered: Mapping[str, float]) -> str:
+    """How good a view held out is by a camera fitted to the volume, and how far that moved."""
+    psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
+    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, smoke moved by {shift:.2f} pixels"

@@ -164,6 +164,13 @@ def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict
     return named
 
 
+def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
+    """Those that the variable `name` of `scene` may have; raises as `value_of`."""
+    is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
+    shape = () if is_pair else tuple(value_of(scene, name).shape)
+    return shapes_in_place(name, shape, scene.volume.grid.shape)
+
+
 def shapes_in_place(
     name: str, shape: tuple[int, ...], cells: tuple[int, ...]
 ) -> list[tuple[int, ...]]:
