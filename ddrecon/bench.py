@@ -116,15 +116,6 @@ def shoot(scene: Scene) -> Shot:
     return Shot(image.detach(), gradient, middle - start, end - middle, iterations)
 
 
-def exact_scene(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
-    marched in finer steps, ray by ray.
-    """
-    marching = replace(scene.render, steps_per_voxel=max(3, scene.render.steps), tolerance=0.0)
-    diffusion = replace(scene.diffusion, tolerance=1e-8, warm_start=False)
-    return replace(scene, render=marching, diffusion=diffusion)
-
-
 def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
     """An image by so many paths a pixel."""
     start = perf_counter()
@@ -147,7 +138,11 @@ def run_bench(
     }
     exact, solved = dict[str, Shot](), dict[tuple[object, ...], Shot]()
     for name, variant in progress([*variants_of(double, is_quick).items()], "exact solutions"):
-        as_exact = exact_scene(variant)
+        marching = replace(
+            variant.render, steps_per_voxel=max(3, variant.render.steps), tolerance=0.0
+        )
+        diffusion = replace(variant.diffusion, tolerance=1e-8, warm_start=False)
+        as_exact = replace(variant, render=marching, diffusion=diffusion)
         key = _settings(replace(as_exact, render=double.render))
         if key not in solved:  # alike ones are solved once
             solved[key] = shoot(as_exact)
