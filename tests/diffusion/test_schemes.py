@@ -8,7 +8,6 @@ from collections.abc import Callable
 import pytest
 import torch
 from media import (
-    assert_derivatives,
     assert_image_derivatives,
     box_grid,
     convergence_order,
@@ -212,11 +211,13 @@ def test_diffusion_falls_where_light_does_cell_by_cell():
     torch.testing.assert_close(limited, square**-0.5, rtol=1e-9, atol=0)
 
 
-def test_the_light_found_balances():
+def test_the_light_found_balances_and_is_found_again_at_once():
     grid = box_grid(SHAPE)
     source, *fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
-    u = solved(grid, SolveMemory(), 1e-13, source, *fields, outside)
+    memory = SolveMemory()
+    u, _ = (solved(grid, memory, 1e-13, source, *fields, outside) for _ in range(2))
+    assert memory.records[0].iterations > 1 >= memory.records[1].iterations
     residual = LimitedOperator(grid, tensors=(*fields, outside)).apply(u) - source
     assert float(residual.abs().max()) < 1e-11 * float(u.abs().max())
 
@@ -231,21 +232,6 @@ def test_dense_media_diffuse_as_without_a_limit(make):
     torch.testing.assert_close(ours, theirs, rtol=0.03, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_derivatives_agree_with_each_other_and_differences():
-    shape, weights = (2, 3, 2), random_values(1, 2, 3, 2, seed=7)
-    inputs = [4 * random_values(1, *shape, seed=seed) for seed in range(3)]
-    inputs[1] *= random_values(1, *shape, seed=9) > 0.5
-    flux = [random_values(1, *shape, seed=seed) for seed in (4, 5, 6)]
-    arguments = [*inputs, torch.full((1, 1, 1, 1), 0.5, dtype=torch.float64), *flux]
-
-    def total(values: dict[str, Tensor]) -> Tensor:
-        memory = SolveMemory(is_warm=False)
-        return (weights * solved(box_grid(shape), memory, 1e-14, *values.values())).sum()
-
-    assert_derivatives(total, {str(k): value for k, value in enumerate(arguments)}, 1e-6)
-
-
 @pytest.mark.parametrize(
     "lights", [{}, {"ambient": None}, {"ambient": None, "directional": None}], ids=str
 )
@@ -254,15 +240,6 @@ def test_an_empty_box_has_finite_derivatives(lights: dict[str, None], make):
     scene = with_values(make(density.detach(), **lights), {"density": density})
     (slope,) = torch.autograd.grad(render(scene).sum(), density)
     assert bool(slope.isfinite().all())
-
-
-def test_iterations_are_recorded_and_resumed(make):
-    scene, memory = make(), SolveMemory()
-    for _ in range(2):
-        render(scene, memory=memory)
-    first, second = memory.records
-    assert first.kind == second.kind == "forward" and first.iterations > 1 >= second.iterations
-    assert first.residual <= 1e-12
 
 
 def test_giving_up_says_what_may_help(make, monkeypatch: pytest.MonkeyPatch):
