@@ -10,7 +10,6 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.grid import Triple
-from ddrecon.light.ground import Ground
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.settings import DiffusionSettings
@@ -151,12 +150,12 @@ def _varies(field: Tensor, axis: int) -> bool:
 
 
 def find_occupied(
-    volume: Volume, media: Sequence[Volume], ground: Ground, optimized: Collection[str]
+    volume: Volume, media: Sequence[Volume], optimized: Collection[str]
 ) -> tuple[Triple, Triple]:
     """Where the part of the box of `volume` begins and ends (z, y, x) that has any of `media`.
 
-    Or that glows; 0 to 1 is all of the box. All of it counts along periodic axes and those of a map
-    of the albedo of `ground`, where density is `optimized`, and where there is none.
+    Or that glows; 0 to 1 is all of the box. All of it counts along periodic axes, where density is
+    `optimized`, and where there is none.
     """
     grid, filled = volume.grid, volume.density.new_zeros(volume.grid.shape)
     for medium in media:
@@ -166,8 +165,7 @@ def find_occupied(
     is_open = len(places) > 0 and not any(name.endswith("density") for name in optimized)
 
     def ends(axis: int) -> tuple[float, float]:
-        is_mapped = ground.albedo.ndim > 1 and axis != ground.plane.axis
-        if not is_open or is_mapped or axis in grid.periodic:
+        if not is_open or axis in grid.periodic:
             return 0.0, 1.0
         first, last = int(places[:, axis].min()), int(places[:, axis].max())
         return first / grid.shape[axis], (last + 1) / grid.shape[axis]

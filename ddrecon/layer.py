@@ -17,11 +17,9 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
-from ddrecon.scene import Scene
-from ddrecon.supported import require_above
+from ddrecon.scene import Scene, require_above
 from ddrecon.variables.kinds import PAIRS
-from ddrecon.variables.legal import require_legal, require_scene
-from ddrecon.variables.values import is_real, shapes_of, with_values
+from ddrecon.variables.values import is_real, require_legal, require_scene, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""
@@ -64,7 +62,7 @@ class VolumeRenderer(torch.nn.Module):
         super().__init__()
         require_scene(scene)
         self.scene = scene
-        self.memories: list[SolveMemory] = []
+        self.memory = SolveMemory(scene.diffusion.warm_start)
 
     def extra_repr(self) -> str:
         """The scene, in few words."""
@@ -84,10 +82,9 @@ class VolumeRenderer(torch.nn.Module):
 
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
-        (`ddrecon.variables`). What is None is the scene's. With one more axis in front, of n
-        entries, images are `[n, views, 3, h, w]`. Raises UsageError for a name the scene does not
-        have, for other shapes, another device, and where `render` does; NotImplementedError within
-        `torch.func.vmap` or `torch.func.grad`.
+        (`ddrecon.variables`). What is None is the scene's. Raises UsageError for a name the scene
+        does not have, for other shapes, another device, and where `render` does;
+        NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         inputs = {name: value for name, value in named.items() if value is not None}
@@ -100,28 +97,11 @@ class VolumeRenderer(torch.nn.Module):
         like = self.scene.volume.density
         with torch.autocast("cpu" if like.is_meta else like.device.type, enabled=False):
             inputs = {n: v.to(like.dtype) if is_real(v) else v for n, v in inputs.items()}
-            counts = {name: len(v) for name, v in inputs.items() if self._is_batch(name, v)}
-            if len(set(counts.values())) > 1 or 0 in counts.values():
-                raise UsageError(f"batches differ in size, or hold nothing: {counts}")
-            count, images = next(iter(counts.values()), 1), []
-            # Each entry starts from its own last solutions.
-            while len(self.memories) < count:
-                self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
-            for index, memory in enumerate(self.memories[:count]):
-                memory.records.clear()
-                entry = {n: v[index] if n in counts else v for n, v in inputs.items()}
-                images.append(render(with_values(self.scene, entry), view, memory))
-            return torch.stack(images) if counts else images[0]
+            self.memory.records.clear()
+            return render(with_values(self.scene, inputs), view, self.memory)
 
     if TYPE_CHECKING:
         __call__ = forward  # which torch's own class says nothing of
-
-    def _is_batch(self, name: str, value: Tensor) -> bool:
-        """Whether `value` has an axis of entries in front of what the variable `name` may have."""
-        if not isinstance(value, Tensor):
-            return False
-        shapes, shape = shapes_of(self.scene, name), tuple(value.shape)
-        return shape not in shapes and shape[1:] in shapes
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What torch calls to move a module: the scene's tensors are moved as well."""
@@ -132,7 +112,7 @@ class VolumeRenderer(torch.nn.Module):
                 f"light is not computed in {scene.volume.density.dtype}; leave the layer in "
                 "float32 or float64, what it is given may be of any precision"
             )
-        self.scene, self.memories = scene, []
+        self.scene, self.memory = scene, SolveMemory(scene.diffusion.warm_start)
         return module
 
 

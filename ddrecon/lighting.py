@@ -28,8 +28,7 @@ from ddrecon.medium.optics import transmitted_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import Unrolled
-from ddrecon.scene import Scene
-from ddrecon.supported import require_supported
+from ddrecon.scene import Scene, require_supported
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""

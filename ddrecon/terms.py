@@ -126,7 +126,7 @@ def _light_terms(scene: Scene) -> Iterator[str]:
     if any(isinstance(light, AmbientLight) for light in scene.lights):
         yield "ambient light"
     if scene.ground is not None:
-        plane, albedo = scene.ground.plane, _listed(scene.ground.mean_albedo, is_by_cell=False)
+        plane, albedo = scene.ground.plane, _listed(scene.ground.albedo, is_by_cell=False)
         yield f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}"
 
 

@@ -5,12 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from media import (
-    LOWER,
-    UPPER,
     assert_image_derivatives,
     half_empty,
     light_of,
@@ -23,7 +20,6 @@ from torch import Tensor
 
 from ddrecon import lighting
 from ddrecon.cameras import Camera, look_at
-from ddrecon.errors import FormatError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
 from ddrecon.light.lights import (
@@ -39,7 +35,6 @@ from ddrecon.march.ground import light_evenly, reflect
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
-from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 SHAPE = (6, 7, 5)
@@ -94,29 +89,6 @@ def test_what_a_ground_hides_of_the_sky_is_not_scattered_once_either(albedo: flo
     settings = {"directional": None, "ambient": (1.0,), "model": "none", "albedo": (albedo,)}
     even, directed = (render(on_ground(random_values(*SHAPE), g=g, **settings)) for g in (0, 1e-9))
     torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
-
-
-def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -> None:
-    scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0, -1, 0))
-    rows, columns = 8, 10
-    z, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (rows, columns))
-    scene.ground = Ground((0.2 + 0.5 * z[:, None] + 0.1 * x)[None], scene.ground.plane)
-    pose = look_at(tensor(0, 9, 0.05), tensor(0, 0, 0.05), tensor(0, 0, -1))
-    scene.views = [View("above", Camera(pose, (30, 30), 1.2, is_perspective=False))]
-    row = 0.05 + 1.2 * (2 * (torch.arange(30, dtype=torch.float64) + 0.5) / 30 - 1)
-    v, u = (row[:, None] - LOWER[0]) / (UPPER[0] - LOWER[0]), (row - 0.05 - LOWER[2]) / 0.9
-    inside = ((v > 0) & (v < 1)) & ((u > 0) & (u < 1))
-    v, u = v.clamp(0.5 / rows, 1 - 0.5 / rows), u.clamp(0.5 / columns, 1 - 0.5 / columns)
-    expected = torch.where(inside, 0.2 + 0.5 * v + 0.1 * u, 0.5) * 3 / math.pi
-    torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-12, atol=0)
-
-
-def test_an_even_map_is_a_number() -> None:
-    scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
-    known, ground = render(scene), scene.ground
-    even = ground.albedo.view(3, 1, 1).expand(3, 5, 7)
-    found = render(replace(scene, ground=replace(ground, albedo=even)))
-    torch.testing.assert_close(found, known, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("form", ["ambient", "environment"])
@@ -178,7 +150,7 @@ def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["p1", "coarse", "maps"])
+@pytest.mark.parametrize("kind", ["p1", "coarse", "sky"])
 def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if kind == "coarse":
         monkeypatch.setattr(lighting, "MOST_CELLS", 4)
@@ -188,8 +160,7 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
     scene.lights.append(PointLight(tensor(0.3137, 1.0, -0.2213), tensor(2.0)))
     beam = tensor(0.1137, 2.0, 0.0213), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
     scene.lights.append(BeamLight(*beam))
-    if kind == "maps":
-        scene.ground = replace(scene.ground, albedo=random_values(3, 5, 9))
+    if kind == "sky":
         sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 3)
         scene.lights.append(sky)
     names = "density", "ground.albedo", "lights.0.irradiance", "lights.0.direction"
@@ -244,16 +215,3 @@ def test_texels_are_found_where_they_are() -> None:
     z, x = points[..., 0].flatten(), points[..., 2].flatten()
     torch.testing.assert_close(look_up_texels(texels, grid, plane, z, x), texels.flatten(1))
     assert float(z.max()) > 3 * grid.upper[0] and float(z.min()) < 3 * grid.lower[0]
-
-
-GROUND = "ground={height: -2, albedo: 0.3}"
-
-
-def test_a_map_is_read_as_it_is(tmp_path: Path) -> None:
-    gray = random_values(4, 6).float().numpy()
-    for name, factor in (("a.npy", 1), ("b.npy", 2)):
-        np.save(tmp_path / name, factor * gray)
-    scene = load_scene(BALL, overrides=[GROUND, f"ground.albedo={{file: {tmp_path}/a.npy}}"])
-    torch.testing.assert_close(scene.ground.albedo, torch.from_numpy(gray)[None])
-    with pytest.raises(FormatError, match="an albedo is from 0 to 1"):
-        load_scene(BALL, overrides=[GROUND, f"ground.albedo={{file: {tmp_path}/b.npy}}"])

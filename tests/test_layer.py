@@ -128,53 +128,6 @@ def test_precision_is_the_layers_whatever_it_is_given(given: torch.dtype) -> Non
     assert density.grad is not None and density.grad.dtype == given
 
 
-def test_a_batch_is_its_entries_one_by_one() -> None:
-    """Of densities, cross sections and light directions; the derivative as well."""
-    layer = small_layer()
-    densities = random_values(3, *SHAPE, seed=1).requires_grad_()
-    values = {"lights.0.direction": random_values(3, 3, seed=3) - 2.0}
-    values["lights.1.radiance"] = random_values(3, seed=4)
-    batch = {"density": densities, "sigma_s": random_values(3, 3, seed=2), "values": values}
-    batch["g"] = torch.tensor([0.1, 0.3, 0.5], dtype=torch.float64)
-    images = layer(**batch)
-    weight = random_values(*images.shape, seed=5)
-    (gradient,) = torch.autograd.grad((images * weight).sum(), densities)
-    assert images.shape == (3, 1, 3, 4, 5)
-    for i in range(3):
-        density = densities[i].detach().requires_grad_()
-        values = {name: value[i] for name, value in batch["values"].items()}
-        values["lights.1.radiance"] = batch["values"]["lights.1.radiance"]
-        one = small_layer()(density, sigma_s=batch["sigma_s"][i], g=batch["g"][i], values=values)
-        torch.testing.assert_close(images[i], one, rtol=1e-5, atol=1e-7)
-        (alone,) = torch.autograd.grad((one * weight[i]).sum(), density)
-        torch.testing.assert_close(gradient[i], alone, rtol=1e-3, atol=1e-6)
-    with pytest.raises(UsageError, match="batches differ in size"):
-        layer(density=densities, g=torch.tensor([0.1, 0.2]))
-
-
-BATCHES = {
-    "density": [((2, *SHAPE), 2), ((1, *SHAPE), 1), (SHAPE, None)],
-    "g": [((2,), 2), ((2, *SHAPE), 2), ((2, 1, *SHAPE), 2), (SHAPE, None), ((1, *SHAPE), None)],
-    "sigma_s": [((3,), None), ((2, 3), 2), ((3, 3), 3), ((2, 3, *SHAPE), 2), ((3, *SHAPE), None)],
-    "albedo": [((1,), None), ((2, 1), 2), ((1, 1, *SHAPE), 1), ((1, *SHAPE), None)],
-    "lights.0.direction": [((3,), None), ((2, 3), 2), ((3, 3), 3)],
-    "views.view.exposure": [((3,), None), ((2, 1), 2)],
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "shape", "count"), [(name, *case) for name, cases in BATCHES.items() for case in cases]
-)
-def test_one_axis_more_than_a_number_may_have_is_a_batch(
-    name: str, shape: tuple[int, ...], count: int | None
-) -> None:
-    value = 0.3 + 0.1 * random_values(*shape)
-    images = small_layer()(values={name: value})
-    alone = small_layer()(values={name: value if count is None else value[0]})
-    assert images.shape == (alone.shape if count is None else (count, *alone.shape))
-    torch.testing.assert_close(images if count is None else images[0], alone)
-
-
 DOUBLE = {"dtype": torch.float64}
 NAN = math.nan
 WRONG: dict[str, list[Any]] = {
@@ -236,7 +189,6 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "odd overrides": (lambda: ddrecon.load_scene(BALL, overrides=[3]), "overrides: "),
     "iterations": (lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"), "iterations: "),
     "no views": (lambda: ddrecon.render(replace(small_layer().scene, views=[])), "no view"),
-    "nothing": (lambda: small_layer()(density=torch.ones(0, *SHAPE)), "or hold nothing"),
     "engine": (lambda: ddrecon.use_engine("steam"), "engine steam: "),
     "a path to render": (lambda: ddrecon.render("a.yaml"), "expected a Scene, found str; "),
     "a path's fluence": (lambda: ddrecon.fluence("a.yaml"), "expected a Scene, found str; "),
@@ -246,7 +198,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "another number": (lambda: small_layer()(g=0.3), "g: expected a tensor"),
     "twice": (lambda: small_layer()(**TWICE), "density: given twice"),
     "two pairs": (lambda: small_layer()(**TWO_PAIRS), "sigma_a, sigma_t: "),
-    "every view": (lambda: small_layer()(values=ALL_CAMERAS), "as in views.view.camera"),
+    "every view": (lambda: small_layer()(values=ALL_CAMERAS), "did you mean 'views.view.camera'"),
     "no glow": (lambda: small_layer()(values=NO_GLOW), "volume.emission = torch.zeros(1)"),
     "sparse": (lambda: small_layer()(SPARSE), "density: is torch.float32, t"),
     "complex": (lambda: small_layer()(COMPLEX), "density: is torch.complex64, torch"),
@@ -268,7 +220,11 @@ MIRRORED = torch.tensor([-1.0, 1, 1]).double().diag()[:, [0, 1, 2, 2]]
 RECORDS: dict[str, list[Any]] = {
     "lights": [[SUN], [None]],
     "views": [[None]],
-    "ground": [Ground(tensor(0.5), Plane(NAN, 1)), Ground(tensor(0.5), Plane(-9.0, 7))],
+    "ground": [
+        Ground(torch.ones(1, 2, 3), Plane(-9.0, 1)),
+        Ground(tensor(0.5), Plane(NAN, 1)),
+        Ground(tensor(0.5), Plane(-9.0, 7)),
+    ],
     "diffusion": [{}],
     "volume.phase": [None],
     "volume.black_body": [2000.0],
@@ -324,7 +280,7 @@ def test_what_torch_cannot_do_is_said() -> None:
     def total(values: Tensor) -> Tensor:
         return layer(density=values).sum()
 
-    with pytest.raises(NotImplementedError, match=r"vmap: .*VolumeRenderer takes batches, \[n, z"):
+    with pytest.raises(NotImplementedError, match=r"vmap: .*one after another"):
         torch.func.vmap(total)(density.detach().expand(2, *SHAPE))
     with pytest.raises(NotImplementedError, match=r"use torch\.autograd\.grad or backward"):
         torch.func.grad(total)(density.detach())

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import attenuate_few
@@ -21,7 +20,7 @@ from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
 from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.interpolation import resize, sample_slices
+from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.records import bounded
 
 UPWARDS = 24
@@ -51,36 +50,11 @@ class Plane:
 class Ground:
     """What reflects the part `albedo` [C], from 0 to 1, of the light that falls on a `plane`.
 
-    It does so evenly into all directions. The plane lies at the box's bottom or below. A map of
-    albedo [C, rows, columns] lies under the box, along both axes from low to high; beyond that is
-    its mean.
+    It does so evenly into all directions. The plane lies at the box's bottom or below.
     """
 
     albedo: Tensor
     plane: Plane
-
-    @property
-    def mean_albedo(self) -> Tensor:
-        """That of the whole plane [C]."""
-        return self.albedo if self.albedo.ndim == 1 else self.albedo.mean((1, 2))
-
-    def albedo_at(self, grid: Grid, points: Tensor) -> Tensor:
-        """The albedo at `points` [R, 3] under the box of `grid`, or beyond: [C, R] or [C, 1]."""
-        mean = self.mean_albedo[:, None]
-        if self.albedo.ndim == 1:
-            return mean
-        places = torch.stack([_place(points[:, axis], grid, axis) for axis in self.plane.across])
-        albedo = sample_slices(self.albedo[None], places.flip(0).T[None])[0]
-        return torch.where((places.abs() <= 1).all(0), albedo, mean)
-
-    def albedo_on(self, rows: int, columns: int) -> Tensor:
-        """The mean albedo of so many texels [C, rows, columns]; [C, 1, 1] of what has no map."""
-        mean = self.mean_albedo[:, None, None]
-        if self.albedo.ndim == 1:
-            return mean
-        under = resize(self.albedo, (rows // 2, columns // 2), "area")
-        beyond = columns // 4, columns // 4, rows // 4, rows // 4
-        return mean + pad(under - mean, beyond)
 
 
 def stay_above(sources: Sequence[Source], plane: Plane) -> list[Source]:

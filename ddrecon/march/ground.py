@@ -171,9 +171,8 @@ def reflect(lit: LitGround, medium: Medium, settings: RenderSettings) -> tuple[T
             _, travel = unit_directions(light.direction)
             even = even - travel[plane.axis] * light.irradiance
     texels = direct.unflatten(1, points.shape[:2]) + lit.texels + (lit.even - even).view(-1, 1, 1)
-    albedo, mean = lit.ground.albedo_on(*points.shape[:2]), lit.ground.mean_albedo
-    more = albedo * texels + (albedo - mean.view(-1, 1, 1)) * even.view(-1, 1, 1)
-    return mean / math.pi * even, more / math.pi
+    share = lit.ground.albedo / math.pi
+    return share * even, share.view(-1, 1, 1) * texels
 
 
 def see_ground(
@@ -193,7 +192,7 @@ def see_ground(
     more = look_up_texels(lit.texels, lit.grid, plane, *(points[:, axis] for axis in plane.across))
     direct = _direct_irradiance(lit, medium, points, max(medium.grid.spacing), settings)
     irradiance = lit.even[:, None] + more + direct
-    radiance = lit.ground.albedo_at(medium.grid, points) / math.pi * irradiance
+    radiance = lit.ground.albedo[:, None] / math.pi * irradiance
     colors = max(len(radiance), len(seen))
     seen = seen.expand(colors, len(down))
     return seen.index_copy(1, hit, radiance.expand(colors, -1))

@@ -48,7 +48,7 @@ def require_plain_autograd() -> None:
     if "Vmap" in kinds:
         raise NotImplementedError(
             "torch.func.vmap: light is not computed for many at once; "
-            "ddrecon.VolumeRenderer takes batches, [n, z, y, x], one after another"
+            "render the entries of a batch one after another"
         )
     if "Grad" in kinds:
         raise NotImplementedError(

@@ -30,7 +30,7 @@ from ddrecon.reconstruct.search import Inverse, Objective, Search, Space, Values
 from ddrecon.reconstruct.setup import Level
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.legal import require_legal
+from ddrecon.variables.values import require_legal
 
 
 def optimize(

@@ -101,7 +101,7 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
             "interior": {"type": "ref", "id": MEDIUM},
         },
         **mitsuba_lights(scene.lights),
-        **(_ground(scene.ground, grid) if scene.ground else {}),
+        **({"ground": _ground(scene.ground, grid)} if scene.ground else {}),
     }
 
 
@@ -211,35 +211,19 @@ def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _ground(ground: Ground, grid: Grid) -> dict[str, dict[str, Any]]:
-    """A square in place of the unbounded plane, and one under the box for a map of albedo.
+def _ground(ground: Ground, grid: Grid) -> dict[str, Any]:
+    """A square in place of the unbounded plane, a little below the box.
 
-    Mitsuba's runs from -1 to 1 across +z. They lie a little below the box, and the map above the
-    other square: of two surfaces in the same place rays meet either.
+    Mitsuba's runs from -1 to 1 across +z.
     """
-    up, gap = 2 - ground.plane.axis, NEAR * math.hypot(*grid.extent)
-    height = min(ground.plane.height, grid.lower[ground.plane.axis] - gap)
-
-    def square(halves: Sequence[float], height: float, reflectance: Any) -> dict[str, Any]:
-        place, middle = np.zeros((4, 4)), np.array([*grid.center_xyz, 1.0])
-        middle[up] = height
-        for column, axis in enumerate(((up + 1) % 3, (up + 2) % 3, up)):
-            place[axis, column] = halves[axis]
-        place[:, 3] = middle
-        bsdf = {"type": "diffuse", "reflectance": reflectance}
-        return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
-
-    is_map = ground.albedo.ndim > 1
-    wide = 3 * [FAR * gap / NEAR], height - is_map * gap, _color(ground.mean_albedo)
-    squares = {"ground": square(*wide)}
-    if is_map:
-        # A picture's rows run along the square's second axis.
-        pixels = ground.albedo.detach().cpu().permute((2, 1, 0) if up == 1 else (1, 2, 0))
-        picture = np.ascontiguousarray(pixels.expand(-1, -1, 3), np.float32)
-        texture = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
-        halves = [side / 2 for side in grid.extent[::-1]]
-        squares["ground_map"] = square(halves, height, texture)
-    return squares
+    up, size = 2 - ground.plane.axis, math.hypot(*grid.extent)
+    place = np.zeros((4, 4))
+    for column, axis in enumerate(((up + 1) % 3, (up + 2) % 3, up)):
+        place[axis, column] = FAR * size
+    place[:, 3] = [*grid.center_xyz, 1.0]
+    place[up, 3] = min(ground.plane.height, grid.lower[ground.plane.axis] - NEAR * size)
+    bsdf = {"type": "diffuse", "reflectance": _color(ground.albedo)}
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:

@@ -25,8 +25,7 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures import encode_bytes
 from ddrecon.report.page import page_text
 from ddrecon.report.pictures import diverge, find_high, slices
-from ddrecon.scene import Scene
-from ddrecon.turntable import upright_axis
+from ddrecon.scene import Scene, upright_axis
 
 MOST_CELLS, MOST_OF_PAGE = 1_000_000, 4_000_000
 """A field of more cells is made coarser, by whole factors, and so are those of a page together."""

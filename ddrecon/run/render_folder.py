@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import UsageError, suggestion
+from ddrecon.errors import UsageError
 from ddrecon.extras import advice, load_for_file
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
@@ -38,13 +38,9 @@ from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.job import Outcome
 from ddrecon.run.run_folder import write_volume
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, place_turntable
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import place_turntable
 from ddrecon.variables.values import (
-    component_names,
-    value_of,
-    variable_names,
     variation,
     varied,
 )
@@ -93,10 +89,7 @@ def choose_views(scene: Scene, choice: Choice) -> tuple[Scene, Sequence[View]]:
         try:
             variation(scene, parameter)
         except UsageError as error:
-            names = variable_names(scene)
-            components = [f"{n}.{c}" for n in names for c in component_names(n, value_of(scene, n))]
-            guess = "" if parameter in names else suggestion(parameter, [*names, *components])
-            raise UsageError(f"--gradient {parameter}: {error}{guess}") from None
+            raise UsageError(f"--gradient {parameter}: {error}") from None
     return scene, views
 
 

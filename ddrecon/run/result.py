@@ -101,7 +101,7 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
             light = described["lights"][int(owner.removeprefix("lights."))]
             light["file" if isinstance(value, str) else key] = value
         elif name == "ground.albedo":
-            described["ground"]["albedo"] = {"file": value} if isinstance(value, str) else value
+            described["ground"]["albedo"] = value
         else:
             medium, key = split_name(name)
             section = media[medium]

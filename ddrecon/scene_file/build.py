@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import choose_diffusion, count_colors
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather, suggestion
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -31,7 +31,7 @@ from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume, mix_media
 from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, require_above, require_supported
 from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
@@ -40,19 +40,16 @@ from ddrecon.scene_file.schema import (
     BeamSection,
     DirectionalSection,
     EnvironmentSection,
-    GroundSection,
     LightSection,
     PointSection,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
-from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
     component_names,
     find_volume_readers,
     name_each,
     value_of,
-    variable_names,
 )
 
 LIGHTS: dict[type, Callable[..., Light]] = {
@@ -152,9 +149,9 @@ def _build_parts(
         with problems.collecting():
             lights.append(_build_light(maker, f"lights.{index}.", section))
     ground = None
-    if media and tree.ground is not None:
-        with problems.collecting():
-            ground = _build_ground(maker, tree.ground)
+    if tree.ground is not None:
+        plane = Plane(tree.ground.height, "zyx".index(tree.volume.up))
+        ground = Ground(maker.color("ground.albedo", tree.ground.albedo), plane)
     for name, settings in tree.optimize.parameters.items() if tree.optimize else ():
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
@@ -173,34 +170,11 @@ def _build_light(maker: Maker, owner: str, section: LightSection) -> Light:
         }
         return LIGHTS[type(section)](**numbers)
     pixels = read_referenced(maker.scene_file, f"{owner}file", section.file, _read_map)
-    radiance = _map_of(maker, f"{owner}radiance", pixels)
+    if not maker.tree.may_change(f"{owner}radiance") and (pixels == pixels[..., :1]).all():
+        pixels = pixels[..., :1]
+    radiance = maker.picture(pixels)
     scale, rotation = maker.tensor(section.scale), maker.tensor(section.rotation)
     return EnvironmentLight(radiance, scale, rotation, section.directions, section.up)
-
-
-def _map_of(maker: Maker, name: str, pixels: np.ndarray) -> Tensor:
-    """The variable `name` [C, h, w] of `pixels` [h, w, 3]; gray unless that may change."""
-    if not maker.tree.may_change(name) and bool((pixels == pixels[..., :1]).all()):
-        pixels = pixels[..., :1]
-    return maker.picture(pixels)
-
-
-def _build_ground(maker: Maker, section: GroundSection) -> Ground:
-    name, albedo = "ground.albedo", section.albedo
-    if isinstance(albedo, FieldFile):
-        pixels = read_referenced(maker.scene_file, f"{name}.file", albedo.file, _read_albedo)
-        reflected = _map_of(maker, name, pixels)
-    else:
-        reflected = maker.color(name, albedo)
-    return Ground(reflected, Plane(section.height, "zyx".index(maker.tree.volume.up)))
-
-
-def _read_albedo(path: Path) -> np.ndarray:
-    pixels = read_image(path).pixels
-    if pixels.min() < 0 or pixels.max() > 1:
-        ends = f"{pixels.min():.3g} to {pixels.max():.3g}"
-        raise FormatError(path, f"has values from {ends}; an albedo is from 0 to 1")
-    return pixels
 
 
 def _read_map(path: Path) -> np.ndarray:
@@ -272,9 +246,8 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     key, cells = f"optimize.parameters.{name}", scene.volume.grid.shape
     try:
         value = value_of(scene, name).clone()
-    except UsageError:
-        fault = f"the scene has no such number{suggestion(name, variable_names(scene))}"
-        raise scene_file.refused(key, fault) from None
+    except UsageError as error:
+        raise scene_file.refused(key, str(error)) from None
     kind, init, is_field = kind_of(name), settings.init, settings.field
     if name == "emission" and _is_dark(value):
         # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.

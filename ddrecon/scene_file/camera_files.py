@@ -14,21 +14,17 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, SceneError, gather
-from ddrecon.io.files.atomic import write_json
-from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.read import path_in, read_as
+from ddrecon.scene_file.read import Node, path_in, read_as
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,
@@ -39,10 +35,6 @@ from ddrecon.scene_file.view_schema import (
     split_views,
 )
 from ddrecon.settings import LENSES
-
-if TYPE_CHECKING:
-    from ddrecon.scene import Scene, View
-    from ddrecon.scene_file.load import SceneFile
 
 MAX_BYTES = 64 * 2**20
 OF_TESTS = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
@@ -79,8 +71,6 @@ NUMBERS: Mapping[str, Mapping[str, float]] = {
 """What a camera says of its picture, and within which limits."""
 MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
 """What is refused, as it is not read, of a frame that says no focal length besides."""
-NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
-"""What lenses are called there."""
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
@@ -435,53 +425,3 @@ def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]
     """A key that sorts names by each `number` in them, a regular expression: 2 before 10."""
     words = re.split(f"({number})", name)
     return [float(word) if index % 2 else word for index, word in enumerate(words)], name
-
-
-def export_transforms(
-    scene: Scene, scene_file: SceneFile, path: Path, *, may_exist: bool
-) -> list[Path]:
-    """Writes the views of `scene`, read from `scene_file`, to `path`, and returns what was written.
-
-    Images and masks are named relative to it; a view without an image has no `file_path`. Raises
-    UsageError where `path` exists and may not or its folder is missing, SceneError for views in
-    parallel projection.
-    """
-    require_free_files([path], may_exist=may_exist)
-    frames, tests, folder = list[dict[str, Any]](), list[str](), path.absolute().parent
-    for view, section in zip(scene.views, scene_file.tree.views, strict=True):
-        files = {"file_path": section.image, "mask_path": section.mask}
-        names = {
-            key: Path(os.path.relpath(file, folder)).as_posix()
-            for key, file in files.items()
-            if file is not None
-        }
-        frames.append(names | {"frame": section.frame, "time": section.time} | _camera(view))
-        tests += [names["file_path"]] if view.is_test and "file_path" in names else []
-    models = {frame["camera_model"] for frame in frames}
-    model = models.pop() if len(models) == 1 else "PINHOLE"
-    lists = {TEST_LISTS[0]: tests} if tests else {}
-    write_json(path, {"camera_model": model, **lists, "frames": frames})
-    return [path]
-
-
-def _camera(view: View) -> dict[str, Any]:
-    camera = view.camera
-    if not camera.is_perspective:
-        raise SceneError(
-            f"view {view.name!r}: an orthographic camera has no place in a transforms.json"
-        )
-    (height, width), (x, y) = camera.size, camera.principal_point
-    focal = width / 2 / float(camera.half_width)
-    intrinsics: dict[str, Any] = {
-        "camera_model": "PINHOLE",
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal / camera.pixel_aspect,
-        "cx": float(x) * width,
-        "cy": float(y) * height,
-    }
-    if camera.lens is not None and camera.distortion is not None:
-        coefficients = zip(LENSES[camera.lens], camera.distortion.tolist(), strict=True)
-        intrinsics |= {"camera_model": NAMES[camera.lens]} | dict(coefficients)
-    return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}

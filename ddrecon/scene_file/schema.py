@@ -283,13 +283,11 @@ class GroundSection:
     it, in shadow and in the light of the volume, and it lights the volume.
 
     height: Along `volume.up` [u]: at the bottom of the box, or below.
-    albedo: The part of the light that it reflects; `ground.albedo` can be optimized. A file is a
-        picture, or `.npy`, of what is straight under the box, `[z, x]` (`[y, x]` with `up: z`) from
-        low to high as in volume files; beyond it is its mean.
+    albedo: The part of the light that it reflects; `ground.albedo` can be optimized.
     """
 
     height: float
-    albedo: Color | FieldFile = bounded(minimum=0, maximum=1)
+    albedo: Color = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)

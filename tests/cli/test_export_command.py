@@ -28,18 +28,6 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert kinds == {"directional", "constant"}
 
 
-def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
-    said = succeed("export", "scene.yaml", "-o", "transforms.json").stdout
-    assert said == "written: transforms.json\n"
-    frames = json.loads(Path("transforms.json").read_text())["frames"]
-    assert [frame["file_path"] for frame in frames] == ["front.npy", "side.npy"]
-    before = json.loads(succeed("check", "scene.yaml", "--json").stdout)
-    succeed("export", "scene.yaml", "-o", "transforms.json", "--overwrite")
-    again = "check", "scene.yaml", "--json", "-D", "views={transforms: transforms.json}"
-    after = json.loads(succeed(*again).stdout)
-    assert after | {"iteration_seconds": before["iteration_seconds"]} == before
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".vdb"])
 def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
     values = np.random.default_rng(1).random((4, 5, 6, 3)).astype(np.float32)

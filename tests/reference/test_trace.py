@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
-from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
 from ddrecon.picture import render
@@ -163,19 +162,6 @@ def test_the_background_is_seen_where_we_see_it() -> None:
     scene = replace(scene, lights=LIGHTS["environment"](), render=settings)
     traced = Traced.of(passes(scene, 8, 64))
     assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.02
-
-
-@pytest.mark.parametrize("axis", [1, 2])
-def test_a_map_on_the_ground_is_seen_where_we_see_it(axis: int) -> None:
-    """Turned or mirrored it is another picture."""
-    side = torch.eye(3, dtype=torch.float64)[2 - axis]
-    camera = seen_from(tuple((side + 0.2 * side.roll(1)).tolist()), 0.5, 16)
-    scene = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), camera=camera, model="none")
-    albedo = torch.tensor([[0.1, 0.1, 0.9], [0.1, 0.5, 0.1]], dtype=torch.float64)
-    scene.ground = Ground(albedo.expand(3, 2, 3), Plane(scene.volume.grid.lower[axis], axis))
-    scene = replace(scene, lights=[DirectionalLight(-side, COLORS)], render=FINE)
-    traced = Traced.of(passes(scene, 2, 32))
-    assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.05
 
 
 def test_seeds() -> None:

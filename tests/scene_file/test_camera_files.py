@@ -5,22 +5,19 @@ import json
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from example_scene import SCENE, changed
+from example_scene import changed
 
-from ddrecon.cameras import cast_rays, project
+from ddrecon.cameras import cast_rays, distort, project
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.build_views import remove_pictures
-from ddrecon.scene_file.camera_files import MODELS, UNMODELED, export_transforms
+from ddrecon.scene_file.camera_files import MODELS, UNMODELED
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
@@ -263,47 +260,10 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
     assert line.startswith(f"transforms.json: {problem}")
 
 
-def test_a_film_begins_at_its_time(read: Read, views: Any, tmp_path: Path) -> None:
-    """What others call a time, of pictures, is none; it comes back when views are exported."""
+def test_a_film_begins_at_its_time(views: Any) -> None:
+    """What others call a time, of pictures, is none."""
     timed = views(frame("a.mp4", time=0.5), frame("b.png", time=0.5), **NERFSTUDIO)
     assert [view.time for view in timed] == [0.5, 0.0]
-    empty = read(transforms(tmp_path / "t.json", frame(None), frame(None), **NERFSTUDIO))
-    scene = load_scene(tmp_path / "scene.yaml", dtype=torch.float64)
-    whole = replace(empty, tree=replace(empty.tree, views=timed))
-    export_transforms(scene, whole, tmp_path / "again.json", may_exist=False)
-    first = json.loads((tmp_path / "again.json").read_text())["frames"][0]
-    assert (first["time"], first["file_path"]) == (0.5, "a.mp4")
-
-
-def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
-    """Cameras, images, masks and splits, also from a folder of its own."""
-    (tmp_path / "images").mkdir()
-    (tmp_path / "out").mkdir()
-    for name in ("a", "b"):
-        np.save(tmp_path / f"images/{name}.npy", np.ones((6, 8, 3), np.float32))
-    camera = {"type": "perspective", "matrix": POSE, "fov": 30, "pixel_aspect": 1.05}
-    camera |= {"principal_point": [0.4, 0.55], "resolution": [8, 6]}
-    front = {"name": "a", "image": "images/a.npy", "mask": "images/b.npy", "camera": camera}
-    side = {"name": "b", "image": "images/b.npy", "split": "test", "camera": camera | {"fov": 40}}
-    scene_file = read(json.dumps(yaml.safe_load(SCENE) | {"views": [front, side]}))
-    before, path = build_scene(scene_file, dtype=torch.float64), tmp_path / "out/transforms.json"
-    assert export_transforms(before, scene_file, path, may_exist=False) == [path]
-    again = read(changed(views={"transforms": "out/transforms.json"}))
-    for old, new in zip(scene_file.tree.views, again.tree.views, strict=True):
-        assert new.image is not None and (old.name, old.split) == (new.name, new.split)
-        assert new.image.resolve() == old.image
-        assert (new.mask and new.mask.resolve()) == old.mask
-    for old, new in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):
-        rays = cast_rays(old.camera).direction, cast_rays(new.camera).direction
-        torch.testing.assert_close(*rays, rtol=0, atol=1e-14)
-        assert torch.equal(old.camera.pose, new.camera.pose) and old.camera.size == new.camera.size
-
-
-def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
-    scene_file = read(SCENE.replace("perspective", "orthographic").replace("fov: 28", "width: 2"))
-    with pytest.raises(SceneError, match="orthographic camera has no place"):
-        path = tmp_path / "t.json"
-        export_transforms(build_scene(scene_file), scene_file, path, may_exist=False)
 
 
 DISTORTED = {
@@ -314,16 +274,13 @@ DISTORTED = {
 
 @pytest.mark.parametrize("model", DISTORTED)
 def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> None:
-    """Through our own scene files and transforms, to the same rays."""
+    """Through our own scene files, to the same lens."""
     numbers = SIZES | IGNORED | {"camera_model": model, **DISTORTED[model]}
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
     dump_scene(describe(scene_file), tmp_path / "dump.yaml")
     assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
-    scene = build_scene(scene_file, dtype=torch.float64)
-    export_transforms(scene, scene_file, tmp_path / "again.json", may_exist=True)
-    again = build_scene(read(changed(views={"transforms": "again.json"})), dtype=torch.float64)
-    rays = [cast_rays(built.views[0].camera).direction for built in (scene, again)]
-    torch.testing.assert_close(*rays, rtol=0, atol=1e-15)
+    (view,) = build_scene(scene_file, dtype=torch.float64).views
+    assert view.camera.distortion.tolist() == [*DISTORTED[model].values()]
 
 
 LEFT = {"w": 40, "h": 1000, "fl_x": 20.0, "fl_y": 2e3, "cx": 0.0, "cy": 500.0, "k1": -0.3}
