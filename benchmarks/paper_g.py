@@ -14,8 +14,8 @@ import torch
 from figures import keep
 from paper_figures import CONFIGS, SHAPES
 
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene_file.build import load_scene
 from ddrecon.uncertainty.experiments import Uncertainty
 

@@ -30,7 +30,7 @@ from paper_figures import (
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import resample
+from ddrecon.medium.levels import resample
 
 NAMES_13 = {
     "default": "default",
