@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from figures import print_header, print_row
+from figures import print_header, print_row, run
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -78,15 +77,6 @@ def write_scene(folder: Path, cells: int, pixels: int, title: str, is_optimized:
     return path
 
 
-def peak(command: list[str]) -> int:
-    """The highest resident size [bytes] of `command`."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise RuntimeError(process.stderr.read().decode())
-    return usage.ru_maxrss * 1024
-
-
 class Alive(TorchDispatchMode):
     """Counts the bytes of all tensors that are alive, at their `peak`, and `where` that was."""
 
@@ -134,14 +124,14 @@ def count(folder: Path, cells: int, title: str) -> tuple[float, float, str]:
         scene.volume.density = scene.volume.density.clone()
         render_each(scene, scene.views, SolveMemory())
     with Alive() as iteration:
-        run = Reconstruction(scene)
-        while not run.is_done:
-            run.step()
+        search = Reconstruction(scene)
+        while not search.is_done:
+            search.step()
     numbers = [mode.peak / 4 / cells**3 for mode in (render, iteration)]
     return *numbers, iteration.where
 
 
-def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tuple[int, int]:
+def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tuple[float, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
     path = str(write_scene(folder, cells, pixels, title, verb == "optimize"))
     program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
@@ -150,7 +140,7 @@ def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tup
     command = [*program, verb, path, "-o", str(folder / verb), "--overwrite", "-q"]
     if verb == "solve":
         command = [sys.executable, "-c", SOLVE, path]
-    return peak(command), int(json.loads(report)["memory_bytes"])
+    return run(command).memory * 2**20, int(json.loads(report)["memory_bytes"])
 
 
 def main() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -48,17 +47,6 @@ class Pair:
     def white(self) -> float:
         """The value shown brightest."""
         return max(float(np.quantile(self.ours if self.truth is None else self.truth, 0.999)), 1e-6)
-
-
-def ddrecon(*arguments: str | Path) -> None:
-    """Runs a command, quietly."""
-    command = ["ddrecon", *arguments, "-q", "--overwrite"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-def as_options(overrides: Sequence[str]) -> list[str]:
-    """`overrides` as a command takes them."""
-    return [part for override in overrides for part in ("-D", override)]
 
 
 def read_log(run: Path) -> Log:
@@ -150,7 +138,7 @@ def show(axis: Any, values: Array | None, white: float, colors: str = "viridis")
     if values is None:
         axis.axis("off")
     elif values.ndim == 3:
-        axis.imshow(srgb.encode(np.clip(values / white, 0, 1)))
+        axis.imshow(encode(np.clip(values / white, 0, 1)))
     else:
         axis.imshow(values, cmap=colors, vmin=0, vmax=white)
 

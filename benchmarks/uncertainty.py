@@ -10,7 +10,6 @@ against its deviation. What FOLDER/uncertainty does not hold of pictures is trac
 from __future__ import annotations
 
 import argparse
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from figures import print_header, print_row
+from figures import ddrecon, print_header, print_row
 from torch import Tensor
 
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.medium.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
@@ -74,8 +73,7 @@ def trace_ball(folder: Path) -> Known:
 def with_traced(scene: Scene, truth: Path, folder: Path) -> Scene:
     """`scene` with pictures of the scene file `truth`, which `folder` keeps."""
     if not (folder / "reference.json").is_file():
-        command = ["ddrecon", "reference", truth, "-o", folder, "--overwrite", "--views", "-q"]
-        subprocess.run([*map(str, command), "--spp", str(PATHS)], check=True, capture_output=True)
+        ddrecon("reference", truth, "-o", folder, "--views", "--spp", str(PATHS))
     images = {v.name: np.load(folder / f"{v.name}.npy").transpose(2, 0, 1) for v in scene.views}
     return replace(
         scene, views=[replace(v, image=torch.tensor(images[v.name])) for v in scene.views]

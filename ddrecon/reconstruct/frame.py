@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, Replays, solve_tolerances
 from ddrecon.reconstruct.metric import Point, find_diagonals
@@ -26,7 +26,9 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Row:
-    """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
+    """One iteration, and the volume that it leaves: the last that the search accepted.
+
+    PSNRs [dB] and SSIMs are means over views, of values as they are compared.
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
@@ -46,24 +48,14 @@ class Row:
     ssim: float | None = None
     test_ssim: float | None = None
 
-    def after(self, total: Row, is_accepted: bool) -> Row:
-        """The running totals of the log with this row: sums, and quality as last known.
-
-        Of a candidate that was refused, its quality does not count.
-        """
-        stale = () if is_accepted else OF_CANDIDATE
-        known = {
-            name: getattr(total, name)
-            for name, value in vars(self).items()
-            if value is None or name in stale
-        }
+    def after(self, total: Row) -> Row:
+        """The running totals of the log with this row: sums, and quality as last known."""
+        known = {name: getattr(total, name) for name, x in vars(self).items() if x is None}
         counts = "forward_iterations", "adjoint_iterations"
         sums = {name: getattr(total, name) + getattr(self, name) for name in counts}
         return replace(self, **known, **sums)
 
 
-OF_CANDIDATE = ("loss", "data_loss", "penalty", "psnr", "ssim")
-"""What a row says of a candidate, which may be refused."""
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
 
@@ -186,14 +178,14 @@ class Frame:
     ) -> Row:
         """The log's row of an iteration, which took `seconds`; the prior counts by `weight`.
 
-        The running totals keep the losses of the last candidate that the search accepted.
+        Of a candidate that was refused it has what the volume before it came to.
         """
         loss, prior = evaluation.loss, weight * evaluation.prior
         unit, counts = self.problem.unit, Counter[str]()
         for record in self.memory.records:
             counts[record.kind] += record.iterations
         quality = dict[str, float]()
-        if is_test_due:
+        if is_test_due and is_accepted:
             quality["ssim"] = evaluation.compared.similarity()
         if is_test_due and self.level.test.views:
             quality["test_psnr"], quality["test_ssim"] = render_quality(
@@ -211,7 +203,10 @@ class Frame:
             cells=self.level.train.volume.grid.cells,
             **({"test_psnr": None} | quality),
         )
-        self.total = row.after(self.total, is_accepted)
+        if not is_accepted:
+            kept = "loss", "data_loss", "penalty", "psnr"
+            row = replace(row, **{name: getattr(self.total, name) for name in kept})
+        self.total = row.after(self.total)
         return row
 
     def current_scene(self) -> Scene:

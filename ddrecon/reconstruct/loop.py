@@ -28,7 +28,7 @@ from ddrecon.reconstruct.search import Objective, Pair, Search, Space
 from ddrecon.reconstruct.setup import Level
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.legal import require_legal
+from ddrecon.variables.values import require_legal
 
 
 def optimize(

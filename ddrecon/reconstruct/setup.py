@@ -13,8 +13,8 @@ from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
-from ddrecon.medium.levels import resample, volume_at_level
-from ddrecon.pictures.noise import Noise, estimate_noise
+from ddrecon.medium.coefficients import resample, volume_at_level
+from ddrecon.pictures import Noise, estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import describe_flaw, target_of
 from ddrecon.reconstruct.parameters import Parameter

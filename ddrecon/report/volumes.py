@@ -22,11 +22,10 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.io.images.table import png_of
 from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.report.page import page_text
 from ddrecon.report.pictures import diverge, find_high, slices
-from ddrecon.scene import Scene
-from ddrecon.turntable import upright_axis
+from ddrecon.scene import Scene, upright_axis
 
 MOST_CELLS, MOST_OF_PAGE = 1_000_000, 4_000_000
 """A field of more cells is made coarser, by whole factors, and so are those of a page together."""
@@ -138,7 +137,7 @@ def _embed(field: Shown, most: int) -> dict[str, Any]:
     cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
     if is_signed := bool(cells.min() < 0):
         cells = diverge(cells.mean(-1))
-    packed = gzip.compress(srgb.encode_bytes(cells).tobytes(), mtime=0)
+    packed = gzip.compress(encode_bytes(cells).tobytes(), mtime=0)
     return {
         "name": field.name,
         "of": field.of,

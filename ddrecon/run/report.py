@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -128,8 +128,6 @@ def psnr_text(summary: Mapping[str, Any]) -> str:
     text = f"PSNR {summary['psnr']:.2f} dB"
     if summary.get("test_psnr") is not None:
         text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
-    if registered := summary.get("registered"):
-        text += f" (registered {_registered_text(registered)})"
     return text
 
 
@@ -172,7 +170,7 @@ def _describe_views(findings: Findings) -> dict[str, Any]:
     groups: dict[str, list[tuple[bytes, bytes, str]]] = {"Held out": [], "Trained on": []}
     for view in shown:
         target, render = (
-            webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
+            webp_of(encode_bytes(pixels(shrink(image, most)) / white))
             for image in (target_of(view), findings.images[view.name])
         )
         caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
@@ -199,11 +197,4 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
         if f"fitted_{key}" in quality:
             values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
             text += f", {key} {values} fitted to it"
-    registered = quality.get("registered")
-    return text + (f"; registered {_registered_text(registered)}" if registered else "")
-
-
-def _registered_text(registered: Mapping[str, float]) -> str:
-    """How good a view held out is by a camera fitted to the volume, and how far that moved."""
-    psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
-    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, smoke moved by {shift:.2f} pixels"
+    return text

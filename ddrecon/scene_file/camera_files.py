@@ -27,8 +27,7 @@ from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.read import path_in, read_as
+from ddrecon.scene_file.read import Node, path_in, read_as
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,

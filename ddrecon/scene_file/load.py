@@ -21,8 +21,16 @@ from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.records import Violation
 from ddrecon.scene_file.camera_files import in_order, node_of, read_colmap, read_transforms
-from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
-from ddrecon.scene_file.read import Rule, path_in, read_record
+from ddrecon.scene_file.read import (
+    MAX_DEPTH,
+    Node,
+    Rule,
+    describe_found,
+    parse,
+    path_in,
+    read_record,
+    resolve,
+)
 from ddrecon.scene_file.schema import SceneTree
 from ddrecon.scene_file.view_schema import (
     FRAME,

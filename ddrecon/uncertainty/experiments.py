@@ -24,7 +24,7 @@ from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
-from ddrecon.pictures.noise import LEAST
+from ddrecon.pictures import LEAST
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.gradients import own_views
 from ddrecon.reconstruct.loop import Reconstruction

@@ -32,10 +32,8 @@ from ddrecon.light_field import fluence_of, multiply_scatters
 from ddrecon.lighting import solve_light
 from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
-from ddrecon.medium.coefficients import Medium, keep_medium
-from ddrecon.medium.levels import refine_medium
+from ddrecon.medium.coefficients import Medium, keep_medium, refine_medium, remaining_moments
 from ddrecon.medium.optics import reflectance, transmitted_moments
-from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings

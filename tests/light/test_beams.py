@@ -28,11 +28,13 @@ from ddrecon.light.profile import profile_in
 from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_masses
 from ddrecon.lighting import fluence, solve_light
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.medium.levels import refine_medium
-from ddrecon.medium.remaining import (
+from ddrecon.medium.coefficients import (
+    Medium,
+    Volume,
     backward_fraction,
+    refine_medium,
     remaining_moments,
+    scale_medium,
     unturned_moments,
 )
 from ddrecon.numerics.quadrature import sphere_quadrature

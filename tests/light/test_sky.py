@@ -23,16 +23,19 @@ from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid, array_order
-from ddrecon.light.environment import (
-    environment_radiance,
-    pixel_moments,
-    refine_map,
-)
 from ddrecon.light.lights import DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.light.reduced import sum_unscattered_sky
-from ddrecon.light.sky import MAX_SUNS, count_suns, decompose_map, fibonacci_sphere
+from ddrecon.light.sky import (
+    MAX_SUNS,
+    count_suns,
+    decompose_map,
+    environment_radiance,
+    fibonacci_sphere,
+    pixel_moments,
+    refine_map,
+)
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.picture import render
 

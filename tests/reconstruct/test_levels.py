@@ -7,8 +7,8 @@ import torch
 
 from ddrecon.cameras import CELL, Camera, cast_rays, cell_width
 from ddrecon.grid import Grid
-from ddrecon.medium.levels import resample
-from ddrecon.pictures.noise import Noise
+from ddrecon.medium.coefficients import resample
+from ddrecon.pictures import Noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.setup import factors, scene_at_level

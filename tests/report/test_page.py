@@ -23,7 +23,7 @@ import ddrecon
 from ddrecon.cameras import project
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode, encode_bytes
 from ddrecon.reconstruct.frame import Row
 from ddrecon.report import volumes
 from ddrecon.report.page import Plot, draw_curve, page_text, write_page
@@ -162,7 +162,7 @@ def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None
     (found,) = embedded(Shown("albedo", "truth", values, white=1.5))
     assert (found["name"], found["of"], found["size"]) == ("albedo", "truth", [5, 4, 3])
     cells = values.permute(1, 2, 3, 0) if colors else values[..., None]
-    expected = 255 * srgb.encode(np.clip(cells.numpy() / 1.5, 0, 1))
+    expected = 255 * encode(np.clip(cells.numpy() / 1.5, 0, 1))
     assert np.abs(found["cells"] - expected).max() <= 0.501
 
 
@@ -172,7 +172,7 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
     values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
     (found,) = embedded(Shown("density", "result", values, white=1.0))
     assert found["size"] == [3, 2, 3]
-    expected = 255 * srgb.encode(float(values[4:, 2:, 2:4].mean()))
+    expected = 255 * encode(float(values[4:, 2:, 2:4].mean()))
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
 
 
@@ -181,7 +181,7 @@ def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
     values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
     (found,) = embedded(Shown("g", "result", values, find_white_value(values)))
     page = found["cells"][0, 0].astype(float)
-    picture = srgb.encode_bytes(slices(values)[0, :5]).astype(float)
+    picture = encode_bytes(slices(values)[0, :5]).astype(float)
     for blue, light_blue, white, light_red, red in (page, picture):
         assert (white == 255).all()
         assert blue[2] > blue[0] and red[0] > red[2]

@@ -15,9 +15,8 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.cameras import cast_rays, project
+from ddrecon.cameras import cast_rays, distort, project
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.build_views import remove_pictures
 from ddrecon.scene_file.camera_files import MODELS, UNMODELED, export_transforms

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from example_scene import CAMERA, SCENE, changed, volume
 
+from ddrecon.scene import upright_axis
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import (
     SceneFile,
@@ -22,7 +23,6 @@ from ddrecon.scene_file.load import (
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
 from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
-from ddrecon.turntable import upright_axis
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]

@@ -33,6 +33,8 @@ volume.density={{heights: [0], values: [-1]}} => volume.density.values: must be 
 volume.density={{labels: two.npz, table: [1, 2]}} => density.table: expected one for each label, 3
 volume.density={{labels: two.npz, table: [1, 2, -3]}} => volume.density.table: must be at least 0
 volume.density={{labels: two.npz, table: [1, 2, [1, 2, 3]]}} => expected numbers: colors
+volume.media={{a: {MEDIUM}}} => volume: give only one of density or media
+volume.density={{file: a.npz, labels: two.npz}} => density: give only one of file or labels
 volume.albedo=0.5 => volume: give only one of sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1}} => volume: missing sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1, sigma_t: 1, albedo: ~}} => volume: missing key 'albedo'
@@ -97,7 +99,7 @@ optimize.parameters={{}} => optimize.parameters: names no parameter; known: dens
 optimize.loss=l3 => optimize.loss: expected one of l2, l1, huber, relative_l2, display, photon
 optimize.parameters.densty={{}} => parameters.densty: unknown parameter; did you mean 'density'?
 optimize.parameters.media.cloud.g={{field: true}} => it is not a field, so it has none
-optimize.parameters.phase.g={{}} => parameters.phase.g: the scene has no such number; known: density
+optimize.parameters.phase.g={{}} => parameters.phase.g: no variable
 optimize.parameters.density.support=0.1 => density.support: expected one of masks, auto
 optimize.parameters.g.support=auto => g.support: 'auto' is for density alone
 optimize.parameters.density={{min: 2, max: 1}} => density.max: 1 is not above min, 2
@@ -110,7 +112,7 @@ optimize.parameters={{albedo: {{}}, sigma_s: {{}}}} => albedo: cannot be optimiz
 optimize.parameters.lights.7.irradiance={{}} => did you mean 'lights.0.irradiance'?
 optimize.parameters.lights.0.direction={{init: 3}} => direction.init: expected a list of 3 numbers
 optimize.parameters.lights.0.irradiance={{init: {{file: cells.npz}}}} => irradiance is not a field
-optimize.parameters.views.back.camera={{}} => no such number; did you mean 'views.front.camera'?
+optimize.parameters.views.back.camera={{}} => did you mean 'views.front.camera'?
 volume.g => -D volume.g: expected key.path=value
 =3 => -D =3: expected key.path=value
 volume.g.x=3 => -D volume.g.x=3: volume.g.x: volume.g is 0.3, not a mapping or list

@@ -44,7 +44,7 @@ def test_a_hard_case_keeps_its_bounds(name: str):
 @pytest.mark.parametrize(("numbers", "failures"), BROKEN)
 def test_each_broken_bound_is_told(numbers: dict[str, float], failures: list[str]):
     """And no bound that is kept: residuals may be what rounding makes of them."""
-    assert find_failures(dict.fromkeys(hard.HEAD, 0.0) | numbers) == failures
+    assert find_failures(dict.fromkeys(hard.NUMBERS, 0.0) | numbers) == failures
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):

@@ -136,7 +136,7 @@ def read_field(path: Path, name: str) -> Field:
     with guard_reading(path):
         if kind.names and name not in (names := kind.names(path)):
             names_text = ", ".join(map(repr, names)) or "none"
-            advice = f"; say name: {names[0]} beside file" if len(names) == 1 else ""
+            advice = f"; say name: {names[0]} beside its path" if len(names) == 1 else ""
             raise FormatError(path, f"has no field {name!r}; it has {names_text}{advice}")
         return kind.read(path, name)
 

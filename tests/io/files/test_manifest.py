@@ -1,6 +1,5 @@
 """A folder knows what was written there by which kind of job; all else stays as it is."""
 
-import threading
 from itertools import permutations
 from pathlib import Path
 
@@ -130,21 +129,3 @@ def test_where_nothing_was_written_no_folder_is_left(tmp_path: Path) -> None:
         write_json(tmp_path / "a/b/kept", 0)
         raise ZeroDivisionError
     assert kind_of_folder(tmp_path / "a/b") == RUN
-
-
-def test_who_waits_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddrecon.io.files.folders.PATIENCE", 0.0)
-    told, entered = list[str](), threading.Event()
-
-    def wait() -> None:
-        with claim_folder(tmp_path, FILM, resume=True, tell=told.append):
-            entered.set()
-
-    waiting = threading.Thread(target=wait)
-    with claim_folder(tmp_path, FILM):
-        waiting.start()
-        while not told:
-            waiting.join(0.01)
-        assert not entered.is_set() and "is writing there; waiting for it" in told[0]
-    waiting.join()
-    assert entered.is_set() and len(told) == 1

@@ -45,7 +45,7 @@ SHAPES = (), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 2), (0, 2, 2)
 BOXES = BOUNDS[::-1], BOUNDS[:1], np.full((2, 3), np.nan), BOUNDS.T
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"lwc": CUBE, "reff": CUBE, "bounds": BOUNDS}, "has no field 'density'; it has 'lwc', 'reff'"),
-    ({"arr_0": CUBE}, "has no field 'density'; it has 'arr_0'; say name: arr_0 beside file"),
+    ({"arr_0": CUBE}, "has no field 'density'; it has 'arr_0'; say name: arr_0 beside its path"),
     *(({"density": np.ones(shape)}, "expected [z, y, x]") for shape in SHAPES),
     ({"density": np.ones((1, 1, 1), complex)}, "complex"),
     ({"density": np.array([[["a"]]])}, "values of type"),
