@@ -23,7 +23,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.picture import render_each
 from ddrecon.progress import Progress, table_lines
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import plume_scene, relative_error
