@@ -50,6 +50,7 @@ from ddrecon.report.pictures import pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import (
     CHECKPOINTS,
+    PREVIOUS,
     Outcome,
     fingerprint,
     has_checkpoint,
@@ -354,6 +355,7 @@ def _drive_frame(film: Film, number: int) -> None:
             scene, title = film.build(scene_file), f"frame {number}"
             job = Run(scene, scene_file, film.environment, film.preview_every, title)
             work(job, folder, is_resumed)
+            (path / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(path, VELOCITY).is_file():
         film.write_velocity(number)
 

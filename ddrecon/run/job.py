@@ -1,14 +1,16 @@
 """A job in a folder: iterations, one after the other, and nothing lost on the way.
 
 Runs, frames of a film, its calibration and experiments are jobs. All ranks work on the same job;
-the first alone has a folder. In it is a checkpoint, a file of tensors and plain values, with a
-description of what the job's result depends on, so that only the same job goes on from it.
+the first alone has a folder. In it are two checkpoints, files of tensors and plain values, each
+with a description of what the job's result depends on, so that only the same job goes on from it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,16 +20,16 @@ from typing import Any, Protocol
 import torch
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, RanksError, UsageError
+from ddrecon.errors import DataWarning, DivergenceError, FormatError, RanksError, UsageError
 from ddrecon.interrupts import defer_interrupt
-from ddrecon.io.files.atomic import replace_file_durably
+from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.io.files.folders import Folder
 from ddrecon.progress import BAR, bar_settings, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
-CHECKPOINTS, LAST = "checkpoints", "last.pt"
-"""The folder of a job's checkpoint, within its own, and its file."""
+CHECKPOINTS, LAST, PREVIOUS = "checkpoints", "last.pt", "previous.pt"
+"""The folder of a job's checkpoints, within its own, and the last and the one before."""
 CHECKPOINT_SECONDS = 60.0
 """A job writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
@@ -92,8 +94,13 @@ def work(job: Job, folder: Folder | None, is_resumed: bool) -> Outcome:
     """
     place = None if folder is None else folder.path / CHECKPOINTS
     if is_resumed:
-        state = {} if place is None else load_checkpoint(place, job.result_of)
-        restore(job, from_first(state), (place or Path()) / LAST)
+        state, loaded = dict[str, Any](), Path()
+        if place is not None:
+            state, loaded = load_checkpoint(place, job.result_of)
+        restore(job, from_first(state), loaded)
+        if place is not None:
+            with refusals(loaded):
+                os.replace(loaded, place / LAST)  # what was damaged after it goes
     if folder is not None:
         job.begin(folder, is_resumed)
     drive(job, place, is_resumed)
@@ -165,7 +172,10 @@ def restore(job: Any, state: Mapping[str, Any], loaded: Path) -> None:
 
 def save_checkpoint(folder: Path, state: dict[str, Any], result_of: Mapping[str, Any]) -> None:
     """Writes `state` as the last checkpoint in `folder`, with what its result depends on."""
-    with replace_file_durably(folder / LAST) as temporary, temporary.open("wb") as stream:
+    with (
+        replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary,
+        temporary.open("wb") as stream,
+    ):
         try:
             torch.save({"format": FORMAT, "scene": result_of, "state": state}, stream)
         except RuntimeError as error:  # in which torch's writer wraps that the disk is full
@@ -174,18 +184,34 @@ def save_checkpoint(folder: Path, state: dict[str, Any], result_of: Mapping[str,
 
 def has_checkpoint(folder: Path) -> bool:
     """Whether there is a checkpoint in `folder`, good or not."""
-    return (folder / LAST).is_file()
+    return any((folder / name).is_file() for name in (LAST, PREVIOUS))
 
 
-def load_checkpoint(folder: Path, result_of: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The state in the checkpoint in `folder`.
+def load_checkpoint(
+    folder: Path, result_of: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], Path]:
+    """The state in the last checkpoint in `folder`, and its file.
 
-    Raises FormatError if it cannot be used, UsageError if there is none or it is not of `result_of`
-    (None: of any).
+    Where that is damaged or gone, it is the one before it, with a warning. Raises FormatError if
+    neither can be used, UsageError if there is none or it is not of `result_of` (None: of any).
     """
-    path = folder / LAST
+    last, previous = folder / LAST, folder / PREVIOUS
     if not has_checkpoint(folder):
-        raise UsageError(f"{path}: there is no checkpoint to resume from; run without --resume")
+        raise UsageError(f"{last}: there is no checkpoint to resume from; run without --resume")
+    try:
+        return _load(last, result_of), last
+    except FormatError as error:
+        if not previous.exists():
+            raise
+        state = _load(previous, result_of)
+        fault = error.reason.partition(";")[0]
+        warnings.warn(f"{last}: {fault}; going on from {previous}", DataWarning, 2)
+        return state, previous
+
+
+def _load(path: Path, result_of: Mapping[str, Any] | None) -> dict[str, Any]:
+    if not path.is_file():
+        raise FormatError(path, f"is missing; {ANEW}")
     try:
         # torch itself does not notice changed bytes, but they are in a zip archive with checksums.
         with zipfile.ZipFile(path) as archive:

@@ -27,7 +27,7 @@ from ddrecon.reconstruct.frame import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.job import CHECKPOINTS, LAST, Job, Outcome, fingerprint, load_checkpoint, restore
+from ddrecon.run.job import CHECKPOINTS, Job, Outcome, fingerprint, load_checkpoint, restore
 from ddrecon.run.quality import Findings, describe_loss, diagnose, find_results, loss_text
 from ddrecon.run.report import FINER, GOES_ON, list_numbers, psnr_text, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
@@ -216,11 +216,11 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
     """
     if not (folder / SCENE).is_file() or not (folder / LOG).is_file():
         raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
-    state = load_checkpoint(folder / CHECKPOINTS)
+    state, loaded = load_checkpoint(folder / CHECKPOINTS)
     run = Reconstruction(
         build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
     )
-    restore(run, state, folder / CHECKPOINTS / LAST)
+    restore(run, state, loaded)
     return run
 
 

@@ -48,7 +48,7 @@ def read_json(path: str) -> Any:
 
 FILES = """ddrecon.manifest scene.yaml result.yaml environment.json loss.csv parameters.json
 summary.json report.html
-volumes volumes/density.npz checkpoints checkpoints/last.pt previews
+volumes volumes/density.npz checkpoints checkpoints/last.pt checkpoints/previous.pt previews
 previews/density.slices.png previews/front.png previews/side.png previews/density.slices.000002.png
 previews/front.000002.png previews/side.000002.png previews/density.slices.000004.png
 previews/front.000004.png previews/side.000004.png"""

@@ -142,11 +142,14 @@ def test_a_run_cannot_go_on_as_another(refuse: Refuse, succeed: Callable[..., ob
     (line,) = refuse(2, *again[:-1], "1", "--resume")
     assert "2 iterations are made already" in line
     path = Path("out/checkpoints/last.pt")
-    for damaged in (path.read_bytes()[:999], b"no checkpoint"):
-        path.write_bytes(damaged)
+    files = path, path.with_name("previous.pt")
+    for damage in (lambda data: data[: len(data) // 2], lambda _: b"no checkpoint"):
+        for each in files:
+            each.write_bytes(damage(each.read_bytes()))
         (line,) = refuse(3, *again, "--resume")
-        assert line.startswith(f"{path}: ")
-    path.unlink()
+        assert re.match(f"{path.parent}/(last|previous).pt: ", line)
+    for each in files:
+        each.unlink()
     assert refuse(2, *again, "--resume")[0].startswith(f"{path}: there is no checkpoint")
 
 

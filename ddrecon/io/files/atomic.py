@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -52,11 +53,20 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replace_file_durably(path: Path) -> Iterator[Path]:
-    """`replace_file` that is safe from a loss of power once it has ended."""
+def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
+    """`replace_file` that is safe from a loss of power once it has ended.
+
+    What `path` was until then is kept as `kept_as`; `path` is there at any time.
+    """
     with replace_file(path) as temporary:
         yield temporary
         flush(temporary)
+        if path.exists():
+            with replace_file(kept_as) as kept:
+                try:
+                    os.link(path, kept)
+                except OSError:  # of a system without links
+                    shutil.copyfile(path, kept)
     with suppress(FormatError):  # Windows and some network drives flush no folders
         flush(path.parent)
 

@@ -45,14 +45,29 @@ def test_an_interrupted_write_leaves_the_old_file(
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_is_there_all_the_while_it_is_replaced(tmp_path: Path) -> None:
-    path, seen = tmp_path / "a.txt", []
-    path.write_text("0")
-    for text in ("1", "2"):
-        with replace_file_durably(path) as temporary:
+@pytest.mark.parametrize("has_links", [True, False])
+def test_the_file_is_there_all_the_while_it_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    """Whole at each step a crash may come after, what it was before is kept, and none is left."""
+    path, kept = tmp_path / "a.txt", tmp_path / "before.txt"
+    replace, seen = os.replace, []
+
+    def look(source: Path, target: Path) -> None:
+        replace(source, target)
+        seen.append(path.read_text())
+
+    def link(*_: Path) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "replace", look)
+    if not has_links:
+        monkeypatch.setattr(os, "link", link)
+    for text in ("1", "2", "3"):
+        with replace_file_durably(path, kept_as=kept) as temporary:
             temporary.write_text(text)
-            seen.append(path.read_text())
-    assert [*seen, path.read_text()] == ["0", "1", "2"] and [*tmp_path.iterdir()] == [path]
+    assert seen == ["1", "1", "2", "2", "3"]
+    assert kept.read_text() == "2" and sorted(tmp_path.iterdir()) == [path, kept]
 
 
 def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
@@ -73,7 +88,7 @@ def test_folders_that_cannot_be_flushed_hold_checkpoints(
         return opened(path, *rest, **others)
 
     monkeypatch.setattr(os, "open", refuse)
-    with replace_file_durably(tmp_path / "a") as temporary:
+    with replace_file_durably(tmp_path / "a", kept_as=tmp_path / "b") as temporary:
         temporary.write_text("new")
     assert (tmp_path / "a").read_text() == "new"
 
