@@ -35,6 +35,7 @@ from figures import print_header, print_row
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from ddrecon.bench import fade, plume_density
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
 from ddrecon.medium.coefficients import Volume
@@ -43,7 +44,6 @@ from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings
-from ddrecon.validate.hard import fade, plume_density
 from ddrecon.variables.values import with_values
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]

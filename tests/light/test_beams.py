@@ -18,6 +18,7 @@ from media import (
 )
 from torch import Tensor
 
+from ddrecon.bench import balance_of
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
@@ -41,7 +42,6 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.validate.hard import balance_of
 
 SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
 
