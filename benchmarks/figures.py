@@ -66,7 +66,7 @@ SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
     ("the same, worst", "eleven", "worst", "default"),
     ("the same by diffusion alone (`transport_rounds: 0`): mean error", "eleven", "mean", "n = 0"),
-    ("the plume above: held-out PSNR", "plume", "as the config has it", "held out"),
+    ("the plume of the two commands: held-out PSNR", "plume", "as the config has it", "held out"),
     ("relative L1 error of its density", "plume", "as the config has it", "L1"),
     ("seconds of the whole process", "plume", "as the config has it", "seconds"),
     (

@@ -38,7 +38,7 @@ from paper_figures import (
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import resample
+from ddrecon.medium.coefficients import resample
 
 TOP = (
     "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | "

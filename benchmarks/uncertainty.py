@@ -23,8 +23,9 @@ from torch import Tensor
 
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import resample, scene_at_level
+from ddrecon.medium.coefficients import resample
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.uncertainty import EMPTY, Uncertainty, mean_around

@@ -41,8 +41,8 @@ from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import render, render_each
 from ddrecon.progress import Progress, table_lines
-from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
+from ddrecon.reconstruct.setup import scene_at_level
+from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.values import with_values
@@ -56,7 +56,7 @@ QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 SPEED_COLUMNS = {"name": "", "image_seconds": ".3f", "both_seconds": ".3f", "times_base": ".2f"}
 SPEED_COLUMNS |= {"iterations": "", "image_numerical": ".1e", "gradient_numerical": ".1e"}
-SPEED_COLUMNS |= {"image_error": "", "verdict": ""}
+SPEED_COLUMNS |= {"image_error": ""}
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,7 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. `is_best`: no
-    other row is known to be faster and as close to the truth.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
@@ -175,7 +174,6 @@ def run_bench(
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
-    mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
     return {
         "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
@@ -219,29 +217,13 @@ def row_of(
     }
 
 
-def mark_best(rows: list[dict[str, Any]], noise: float) -> None:
-    """Marks the `rows` that no other beats in both time of an image and error.
-
-    An error against path tracing is at least what the `noise` of that can tell from none.
-    """
-
-    def error(row: dict[str, Any]) -> float:
-        if row["image_error"] is not None:
-            return max(row["image_error"], least_error(noise))
-        return math.inf if row["image_numerical"] is None else row["image_numerical"]
-
-    for row in rows:
-        faster = (other for other in rows if other["image_seconds"] < row["image_seconds"])
-        row["is_best"] = all(error(other) > error(row) for other in faster)
-
-
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """The report as a Markdown table, and Mitsuba's time; times are multiples of the base's."""
     rows, noise, base = list[dict[str, Any]](), report["truth_noise"], report["rows"][0]
     for row in report["rows"]:
-        times, verdict = row["both_seconds"] / base["both_seconds"], "best" * row["is_best"]
+        times = row["both_seconds"] / base["both_seconds"]
         error = None if noise is None else error_text(row["image_error"], noise)
-        rows.append(row | {"times_base": times, "image_error": error, "verdict": verdict})
+        rows.append(row | {"times_base": times, "image_error": error})
     lines = table_lines(SPEED_COLUMNS, rows)
     if noise is not None:
         times = rows[-1]["image_seconds"] / base["image_seconds"]

@@ -80,11 +80,7 @@ def _find_terms(scene: Scene) -> Iterator[str]:
         yield f"{emission}, {'scattered and seen' if is_diffuse else 'only seen: not scattered'}"
     if volume.index != 1:
         inside = 1 - transmitted_moments(volume.index)[0]
-        outside = ((volume.index - 1) / (volume.index + 1)) ** 2
-        yield (
-            f"refractive index {volume.index:g}: faces reflect {inside:.1%} of diffuse light "
-            f"inside, and {outside:.1%} of light from straight ahead"
-        )
+        yield f"refractive index {volume.index:g}: faces reflect {inside:.1%} of light inside"
     if is_diffuse:
         yield from _diffuse_terms(medium, scene)
     else:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.field import EMPTY, Fields, prune
-from ddrecon.io.volumes.table import FORMATS, read_fields
+from ddrecon.io.volumes.table import FORMATS, NANOVDB, read_fields
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -18,7 +18,7 @@ def describe(path: Path) -> dict[str, Any]:
 
     Raises FormatError when it is neither, or holds nothing that can be read.
     """
-    if path.suffix.lower() in FORMATS:
+    if path.suffix.lower() in (*FORMATS, NANOVDB):
         fields, reasons = read_fields(path)
         bounds = next((field.bounds for field in fields.values()), None)
         values = {name: field.values for name, field in fields.items()}

@@ -15,11 +15,9 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
-from ddrecon.reconstruct.metric import find_diagonals
-from ddrecon.reconstruct.numbers import Point
+from ddrecon.reconstruct.gradients import Differentiated, Replays, solve_tolerances
+from ddrecon.reconstruct.metric import Point, find_diagonals
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
-from ddrecon.reconstruct.recording import Replays
 from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations

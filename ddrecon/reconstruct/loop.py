@@ -20,8 +20,7 @@ from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
-from ddrecon.reconstruct.metric import apply_metric
-from ddrecon.reconstruct.numbers import Numbers
+from ddrecon.reconstruct.metric import Numbers, apply_metric
 from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
@@ -239,11 +238,12 @@ class Reconstruction:
 
     def _add_up(self, evaluations: Sequence[Evaluation]) -> Objective:
         """The objective of all frames at the candidate, with what calibrations say."""
-        loss, slope = self.numbers.penalty(self.search.candidate)
+        gradient = self._gather([e.gradients for e in evaluations])
+        penalty = self.numbers.add_penalty(self.search.candidate, gradient)
         return Objective(
-            loss + sum(e.loss for e in evaluations),
+            penalty + sum(e.loss for e in evaluations),
             from_first(sum(e.prior for e in evaluations)),
-            self._gather([e.gradients for e in evaluations]) + slope,
+            gradient,
             self._gather([e.prior_gradients for e in evaluations]),
         )
 
@@ -280,7 +280,9 @@ class Reconstruction:
             else:
                 moves = residuals * (is_free / diagonal)
             results.append(moves.flatten(1))
-        return torch.cat([*results, self.numbers.precondition(values, free, vectors)], 1)
+        if self.numbers.size:
+            results.append(self.numbers.precondition(values, free, vectors))
+        return torch.cat(results, 1)
 
     def _put(self, values: Tensor) -> None:
         for p, value in zip(self.blocks.values(), self._split(values), strict=True):
@@ -299,12 +301,15 @@ class Reconstruction:
 
     def _gather(self, of_frames: Sequence[Mapping[str, Tensor]]) -> Tensor:
         """The sum of each frame's tensors, by parameter, as a vector; what is missing is 0."""
-        sums = {key: torch.zeros_like(p.value) for key, p in self.blocks.items()}
+        sums: dict[tuple[int, str], Tensor] = {}
         for n, (frame, tensors) in enumerate(zip(self.frames, of_frames, strict=True)):
             for p in frame.parameters:
                 if p.name in tensors:
-                    sums[_key(n, p)] += tensors[p.name]
-        return torch.cat([total.flatten() for total in sums.values()])
+                    key, tensor = _key(n, p), tensors[p.name]
+                    sums[key] = sums[key] + tensor if key in sums else tensor
+        blocks = self.blocks.items()
+        entries = (sums[k] if k in sums else torch.zeros_like(p.value) for k, p in blocks)
+        return torch.cat([entry.flatten() for entry in entries])
 
 
 def _key(number: int, p: Parameter) -> tuple[int, str]:

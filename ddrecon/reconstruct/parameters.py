@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 

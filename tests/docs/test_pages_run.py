@@ -13,7 +13,7 @@ from ddrecon import bench
 from ddrecon.bench import CASES
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]

@@ -20,7 +20,7 @@ from ddrecon.medium.coefficients import (
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.picture import render
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 

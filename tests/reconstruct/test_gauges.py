@@ -8,7 +8,7 @@ import torch
 
 from ddrecon.cameras import Camera, look_at, twist
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.numbers import calibration_prior, find_gauges
+from ddrecon.reconstruct.metric import calibration_prior, find_gauges
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.tuning import SHIFT, TURN
 from ddrecon.scene import Scene

@@ -14,9 +14,9 @@ from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct import loop, tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame
 from ddrecon.reconstruct.gradients import Differentiated
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.run.job import FORMAT, load_checkpoint
 from ddrecon.scene import Scene, View
 

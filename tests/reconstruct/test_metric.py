@@ -11,8 +11,13 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.picture import render
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.metric import apply_metric, find_diagonals
-from ddrecon.reconstruct.numbers import Point, find_matrix, single_numbers
+from ddrecon.reconstruct.metric import (
+    Point,
+    apply_metric,
+    find_diagonals,
+    find_matrix,
+    single_numbers,
+)
 from ddrecon.reconstruct.parameters import Parameter, total_variation
 from ddrecon.scene import Scene, View
 from ddrecon.settings import ParameterSettings
