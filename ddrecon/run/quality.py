@@ -107,13 +107,14 @@ def _find_truths(scene: Scene) -> dict[str, Tensor]:
 
     Fields that are the same in every cell are left out.
     """
-    truths = {}
-    for name, start in scene.starts.items():
-        if is_of_volume(name) and (value := value_of(scene, name)).ndim >= 3:
-            is_start = start.shape == value.shape and torch.equal(start, value)
-            if not is_start and bool((value != value.flatten()[0]).any()):
-                truths[name] = value
-    return truths
+    values = {name: value_of(scene, name) for name in scene.starts if is_of_volume(name)}
+    return {
+        name: value
+        for name, value in values.items()
+        if value.ndim >= 3
+        and not torch.equal(value, scene.starts[name])
+        and bool((value != value.flatten()[0]).any())
+    }
 
 
 def describe_loss(settings: OptimizeSettings, train: Scene) -> dict[str, Any]:
