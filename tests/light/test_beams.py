@@ -36,7 +36,7 @@ from ddrecon.medium.coefficients import (
     scale_medium,
     unturned_moments,
 )
-from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.sphere import sphere_quadrature
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -79,9 +79,9 @@ def test_where_rays_run_through_centers_the_mass_is_that_of_the_cells_behind(dir
 
 
 @pytest.mark.parametrize("direction", SLANTED, ids=str)
-@pytest.mark.parametrize("slope", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.7)], ids=["even", "linear"])
-def test_in_an_even_or_linear_field_the_mass_is_that_of_each_ray(direction, slope):
+def test_in_a_linear_field_the_mass_is_that_of_each_ray(direction):
     """Where no ray comes within two cells of the sides: interpolation of both is exact there."""
+    slope = tensor(0.4, -0.3, 0.7)
     grid, travel = Grid((11, 12, 11), (0, 0, 0), (1.0, 1.2, 0.9)), unit(direction)
     last = travel.new_tensor(grid.shape) - 1
     index = torch.stack(torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij"), -1).double()
@@ -90,8 +90,8 @@ def test_in_an_even_or_linear_field_the_mass_is_that_of_each_ray(direction, slop
     axis = int(speed.abs().argmax())
     step, moved = 1 / speed[axis].abs(), speed / speed[axis].abs()
     count = (index if travel[axis] > 0 else last - index)[..., axis, None]
-    entered, _ = sum_mass_to_cells((20 + index @ tensor(*slope))[None], grid, travel)
-    mean = 20 + (index - (count + 1) / 2 * moved) @ tensor(*slope)
+    entered, _ = sum_mass_to_cells((20 + index @ slope)[None], grid, travel)
+    mean = 20 + (index - (count + 1) / 2 * moved) @ slope
     wanted, first = step * count[..., 0] * mean, index - count * moved
     sides = [other for other in range(3) if other != axis]
     ends = torch.stack([index, first, last - index, last - first])[..., sides]

@@ -36,8 +36,7 @@ from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import choose_sampling, cross_box, intersect_box
 from ddrecon.medium.coefficients import Volume, scale_medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
-from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, SeenPhase, TwoLobe
 from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.picture import render
 from ddrecon.scene import Scene

@@ -17,8 +17,7 @@ from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.light.moments import cut, fill
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 from ddrecon.transport.characteristics import Characteristic, Direction, Ends
 from ddrecon.transport.characteristics import radiance_along as follow
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds
