@@ -169,11 +169,7 @@ def upwards(plane: Plane) -> tuple[Tensor, Tensor]:
 
 @remember
 def _sights(
-    grid: Grid,
-    plane: Plane,
-    settings: RenderSettings,
-    dtype: torch.dtype,
-    device: torch.device,
+    grid: Grid, plane: Plane, settings: RenderSettings, dtype: torch.dtype, device: torch.device
 ) -> tuple[Sight, ...]:
     """Those of rays from all texels, one for each direction."""
     like = torch.empty(0, dtype=dtype, device=device)
