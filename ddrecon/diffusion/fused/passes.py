@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,22 +23,13 @@ from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Pas
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import TensorSteps
 from ddrecon.kernels.launch import launch_later, thread_count
-from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.kernels.text import PACKAGE, Bound, TextKernel, declarations, members_of
 from ddrecon.numerics.remember import may_read
 
-Kind = IntEnum(
-    "Kind",
-    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT DESCEND ASCEND SOLVE TURN PRODUCT "
-    "ADVANCE",
-    start=0,
-)
-"""What a pass does, as `passes.h` has it."""
-PASS = """
-long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-long u, source, out, numbers, sums, steps, axes[3];
-F *c[3], *loss, *inverse, *coupling, *below, *above, *belows[3], *aboves[3], *results[6]
-"""
-"""What a pass is given, as `passes.h` declares it: eight bytes each."""
+HEADER = "diffusion/fused/passes.h"
+_TEXT = (PACKAGE / HEADER).read_text(encoding="utf-8")
+Kind = IntEnum("Kind", re.findall(r"enum Kind {(.*?)}", _TEXT, re.DOTALL)[0], start=0)
+"""What a pass does."""
 TOGETHER = 400
 """Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
@@ -237,7 +229,7 @@ class Program:
     def __init__(self, passes: KernelPasses, name: str, steps: Sequence[int] = (0,)):
         like, self.size, rows = passes.like, passes.size, passes.rows
         self.kernel, self.tensors = passes_kernel(name, 8 * like.itemsize), passes.tensors
-        names = [*entries_of(PASS)]
+        names = [*entries_of(members_of(HEADER, "Pass"))]
         self.table = _write_table([row.get(name, 0) for row in rows for name in names], like)
         # So many cells of all colors are best done by one thread for each color.
         most = -1 if like.is_cuda else SMALL
@@ -294,8 +286,7 @@ def passes_kernel(name: str, bits: int) -> TextKernel:
     }}
     """
     declared = "long *table; int begin, end, shares; F *work, *solution"
-    header = "diffusion/fused/passes.h"
-    return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", header)
+    return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", HEADER)
 
 
 def name_kernels(like: Tensor) -> None:
