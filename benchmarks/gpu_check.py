@@ -36,8 +36,8 @@ from ddrecon.errors import MissingExtraError, SceneError, UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.hard import plume_scene

@@ -58,6 +58,21 @@ def _sweep_chunk(
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
     """The moments of the ordinates of a chunk, and what leaves along each if any enters."""
+    extinction, emitted, gradient = fields
+    tables = ordinate_tables(of[0], of[1], emitted, len(emitted))
+    ordinates = tables.chunks[of[2]].ordinates
+    emitted = torch.tensordot(tables.arrays["values"][ordinates], emitted, 1)
+    means, leaving = _follow_chunk(of, (extinction, emitted, gradient), courses, ends)
+    return torch.tensordot(tables.arrays["weighted"][ordinates].T, means, 1), leaving
+
+
+def _follow_chunk(
+    of: tuple[Grid, int, int],
+    fields: Fields,
+    courses: list[Characteristic],
+    ends: list[Ends] | None,
+) -> tuple[Tensor, list[Ends]]:
+    """Radiance in cells along a chunk's ordinates, and what leaves along each if any enters."""
     if ends is None and not any(course.wraps[0] for course in courses):
         return sweep_ordinates(of, fields)[0], []
     extinction, emitted, gradient = fields
@@ -72,8 +87,8 @@ def _sweep_chunk(
         ]
         rings = [_ring_of_ends(*pair) for pair in zip(courses, entering, strict=True)]
         dark = extinction, torch.zeros_like(emitted), torch.zeros_like(gradient)
-        moments, light = sweep_ordinates(of, dark if is_dark else fields, torch.stack(rings))
-        return moments, [
+        means, light = sweep_ordinates(of, dark if is_dark else fields, torch.stack(rings))
+        return means, [
             _ends_of_ring(*triple) for triple in zip(courses, light, entering, strict=True)
         ]
 

@@ -13,8 +13,9 @@
 // are formed row by row.
 //
 // By cells, for a GPU, and where light enters by faces or goes around: an item is a cell of a
-// slice, for one ordinate and color. A launch does one slice of every ordinate; what ordinates give
-// is summed later. What leaves by a face of a periodic grid enters by the opposite one.
+// slice, for one ordinate and color. A launch does one slice of every ordinate. What moments are
+// along ordinates is known before, and what ordinates give is summed later: as products of matrices.
+// What leaves by a face of a periodic grid enters by the opposite one.
 
 #if IS_GPU
 #define APART INLINE
@@ -82,7 +83,8 @@ template <class F> struct Path {
 
 // What kernels are given. Arrays are [..., colors, cells]; tangents have d_ before their names.
 // What cells emit has moments `source` [count] and rises by `gradient` [3]. `values` and `weighted`
-// [ordinates, count] are harmonics times the path through a cell, and times quadrature weights.
+// [ordinates, count] are harmonics times the path through a cell, and times quadrature weights. By
+// cells `source` and `bars` [ordinates] are sums of moments times these.
 // `light` is I where it leaves cells, and `returning` are cotangents of I where it enters them: for
 // each ordinate and color a ring of `planes` or `back_planes` planes with a rim of zeros. So is
 // `entering`, what enters cells from outside, null for nothing.
@@ -274,23 +276,25 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
 
     // Sums of moments times `by` [ordinates, count], for ordinates from `begin` to `end`.
     // Rows of moments are copied: far apart they would take each other's places in a cache.
+    // By cells sums are what was given.
     INLINE void sum_moments(
         int kind, const F* moments, const F* by, const Row& row, int begin, int end) const {
-        const F* from = moments + color * cells + row.at;
+        if constexpr (BY_CELLS) {
+            *ordinate_row(kind, begin) = moments[place(begin) * cells + row.at];
+            return;
+        }
+        const F* const from = moments + color * cells + row.at;
         F* const copies = scratch + ROWS * pitch;
-        const long long apart = BY_CELLS ? all : pitch;
-        if constexpr (!BY_CELLS) {
-            for (int k = 0; k < of.count; ++k) {
-                INDEPENDENT
-                for (int c = 0; c < width; ++c) copies[k * pitch + c] = from[k * all + c];
-            }
-            from = copies;
+        for (int k = 0; k < of.count; ++k) {
+            INDEPENDENT
+            for (int c = 0; c < width; ++c) copies[k * pitch + c] = from[k * all + c];
         }
         for (int j = begin; j < end; ++j)
             for (int c = 0; c < width; ++c) ordinate_row(kind, j)[c] = F(0);
         F* const sums = ordinate_row(kind, begin);
         by += begin * of.count;
-        Product<F>{sums, 2 * pitch, from, apart, by, of.count, 1}.add(end - begin, of.count, width);
+        Product<F>{sums, 2 * pitch, copies, pitch, by, of.count, 1}.add(
+            end - begin, of.count, width);
     }
     // Adds what ordinates gave in a row, times `by` [ordinates, apart], to `count` of `sums`.
     INLINE void collect(

@@ -3,7 +3,8 @@
 By rows, on a processor, a launch does some planes of a chunk of ordinates, with each team once
 along z and once against it. They meet in the middle, where each goes on in the next launch: so no
 two write to the same cells at once. By cells, on a GPU and where light enters by faces, a launch
-does one slice of all ordinates of a chunk, and products of matrices sum over these.
+does one slice of all ordinates of a chunk, and products of matrices sum over moments and
+ordinates.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, members_of, names_of
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
@@ -39,7 +39,8 @@ Ordinates = tuple[Grid, int, int | None]
 """A grid, how many directions cross it, and which chunk of them, by cells; None: all, by rows."""
 Fields = tuple[Tensor, Tensor, Tensor]
 """What a sweep depends on: extinction [C, z, y, x], the moments [K, C, z, y, x] of what cells emit,
-and its gradient [3, C, z, y, x] from cell to cell.
+of a chunk what they emit along each ordinate's path [ordinates, C, z, y, x], and its gradient
+[3, C, z, y, x] from cell to cell.
 """
 FIELDS = "extinction", "source", "gradient"
 """Their names in kernels."""
@@ -63,7 +64,8 @@ class _Launches:
             _, second, largest = sorted(self.grid.shape)
             self.lanes = second * largest
         pieces = self.pieces if self.by_rows else None
-        self.tables = ordinate_tables(self.grid, directions, self.like, self.count, pieces)
+        moments = self.count if self.by_rows else 1
+        self.tables = ordinate_tables(self.grid, directions, self.like, moments, pieces)
         # Rows and columns of a plane with its rim.
         self.plane = self.grid.shape[1] + 2, self.grid.shape[2] + 2
 
@@ -186,19 +188,19 @@ class _ByCells(_Launches):
     """A chunk of ordinates, of which light may enter cells from outside: a ring like light."""
 
     def follow(self, entering: Tensor | None, _: bool = False) -> tuple[Tensor, Tensor]:
-        """Moments of radiance [K, C, z, y, x], or their change; and light where it leaves cells."""
+        """Means of radiance [ordinates, C, z, y, x], or their change; and what leaves cells."""
         chunk, colors = self._all()
         # Planes behind the grid and, at the end of the ring, before it.
         light, means = self.ring(chunk, colors, self.grid.shape[0] + 2), self._outputs(1)
         follow = self.bind("MOMENTS", chunk, colors, light=light, outputs=means, entering=entering)
         for stage in self._slices(entering):
             follow(stage)
-        return self._sum("weighted", means[0]), light
+        return means[0], light
 
     def go_back(
         self, bars: Tensor, light: Tensor, entering: Tensor | None, light_bar: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        """Cotangents of `fields` and of what is `entering`, of those of moments and `light`."""
+        """Cotangents of `fields` and of what is `entering`, of those of means and `light`."""
         chunk, colors = self._all()
         # The cotangent of what enters takes the place of that of light.
         returning = torch.zeros_like(light) if light_bar is None else light_bar.clone()
@@ -209,8 +211,8 @@ class _ByCells(_Launches):
         for stage in reversed(self._slices(entering)):
             go_back(stage)
         source, rise, extinction = outputs
-        sums = self._sum("values", source), self._sum("moved", rise)
-        return extinction.sum(0), *sums, None if entering is None else returning
+        gradient = torch.tensordot(self.tables.arrays["moved"][chunk.ordinates].T, rise, 1)
+        return extinction.sum(0), source, gradient, None if entering is None else returning
 
     def _all(self) -> tuple[Chunk, slice]:
         assert self.chunk is not None
@@ -224,10 +226,6 @@ class _ByCells(_Launches):
     def _outputs(self, count: int) -> Tensor:
         """What ordinates give in each cell."""
         return self.like.new_empty(count, self._all()[0].count, *self.like.shape[1:])
-
-    def _sum(self, table: str, output: Tensor) -> Tensor:
-        """The sum over ordinates of their `output`, times the `table` of that name."""
-        return torch.tensordot(self.tables.arrays[table][self._all()[0].ordinates].T, output, 1)
 
 
 @functools.cache
@@ -246,8 +244,9 @@ def sweep_ordinates(
 ) -> tuple[Tensor, Tensor]:
     """The moments [K, C, z, y, x] of radiance along ordinates `of` a quadrature set.
 
-    Of a chunk the second result is light where it leaves cells, a ring
-    [ordinates, C, z + 2, y + 2, x + 2] (`ordinates.h`), and so is what is `entering` them.
+    Of a chunk it is the mean in cells along each ordinate [ordinates, C, z, y, x]. The second
+    result is light where it leaves cells, a ring [ordinates, C, z + 2, y + 2, x + 2]
+    (`ordinates.h`), and so is what is `entering` them.
     """
     tensors = *(field.contiguous() for field in fields), entering
     swept: tuple[Tensor, Tensor] = _Sweep.apply(of, torch.is_grad_enabled(), *tensors)
@@ -255,7 +254,7 @@ def sweep_ordinates(
 
 
 class _Sweep(torch.autograd.Function):
-    """Moments, and by rows what the backward pass needs, by cells light where it leaves cells."""
+    """Moments, or means; by rows what the backward pass needs, by cells light that leaves cells."""
 
     @staticmethod
     def forward(of: Ordinates, may_save: bool, *tensors: Any) -> tuple[Tensor, Tensor | None]:
