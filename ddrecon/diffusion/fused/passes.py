@@ -13,7 +13,6 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any
 
 import torch
@@ -27,9 +26,9 @@ from ddrecon.kernels.text import PACKAGE, Bound, TextKernel, declarations, membe
 from ddrecon.numerics.remember import may_read
 
 HEADER = "diffusion/fused/passes.h"
-_TEXT = (PACKAGE / HEADER).read_text(encoding="utf-8")
-Kind = IntEnum("Kind", re.findall(r"enum Kind {(.*?)}", _TEXT, re.DOTALL)[0], start=0)
-"""What a pass does."""
+_KINDS = (PACKAGE / HEADER).read_text(encoding="utf-8").split("enum Kind {")[1].split("}")[0]
+KIND = {name: number for number, name in enumerate(re.findall(r"\w+", _KINDS))}
+"""What passes do, by name."""
 TOGETHER = 400
 """Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
@@ -89,7 +88,7 @@ class KernelPasses(Passes):
 
     def run(self) -> None:
         # Nothing depends on scales: a GPU finds those of all grids at once, at the end.
-        self.rows.sort(key=lambda row: row["kind"] == Kind["SCALE"])
+        self.rows.sort(key=lambda row: row["kind"] == KIND["SCALE"])
         program, nothing = Program(self, "prepare"), self.like.new_empty(1)
         program.run(program.bind(nothing, nothing), 0)
 
@@ -170,7 +169,7 @@ class KernelPasses(Passes):
     ) -> None:
         """Lists a pass over all of `shape` [C, z, y, x]; `width`: of an item, None for a slice."""
         width = 1 if self.like.is_cuda else width or shape[2] * shape[3]
-        row: dict[str, Any] = {"kind": Kind[kind], "items": math.prod(shape) // width}
+        row: dict[str, Any] = {"kind": KIND[kind], "items": math.prod(shape) // width}
         row |= {"width": width, "n": shape[1:], "face_colors": 1}
         if operator:
             row |= {"c": operator.conductances, "loss": operator.loss}
@@ -259,7 +258,7 @@ def _list_launches(
     launches = list[dict[str, int]]()
     for number, row in enumerate(rows[first:last], first):
         is_large = row["items"] * row["width"] > most
-        if number > first and row["kind"] == rows[number - 1]["kind"] == Kind["SCALE"] and most < 0:
+        if number > first and row["kind"] == rows[number - 1]["kind"] == KIND["SCALE"] and most < 0:
             launches[-1]["end"] = number + 1
             continue
         if launches and launches[-1]["shares"] and not is_large:
