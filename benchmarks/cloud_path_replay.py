@@ -21,10 +21,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import resource
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -33,8 +29,8 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from figures import print_header, print_row
-from path_replay import DENSITY, Replay, why_not
+from figures import ddrecon, print_header, print_row
+from path_replay import Replay, why_not
 from reconstruction import ROOT, coarsened
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -106,12 +102,7 @@ def trace_pictures(path: Path, folder: Path) -> None:
 
 def by_us(path: Path, folder: Path) -> tuple[np.ndarray, float]:
     """The density [z, y, x] that `ddrecon optimize` finds, and its processor seconds."""
-    command = [sys.executable, "-m", "ddrecon", "optimize", str(path), "-o", str(folder / "ours")]
-    alone = os.environ | {"OMP_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([*command, "-q", "--overwrite"], check=True, env=alone)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    seconds = ddrecon("optimize", path, "-o", folder / "ours", "--threads", "1").processor
     return read_field(folder / "ours/volumes/density.npz", "density").values, seconds
 
 
@@ -122,7 +113,7 @@ def by_path_replay(scene: Scene, rate: float, seconds: float) -> tuple[np.ndarra
     chosen = [index for index, view in enumerate(scene.views) if not view.is_test]
     start = torch.full_like(scene.volume.density, START)
     scene = replace(scene, volume=replace(scene.volume, density=start))
-    replay = Replay.of(scene, 1.0, len(scene.views))
+    replay = Replay.of(scene, len(scene.views))
     pictures = {index: scene.views[index].image.movedim(0, -1) for index in chosen}
     wanted = {index: replay.module.TensorXf(image.numpy()) for index, image in pictures.items()}
     power = float(np.mean([float(image.square().mean()) for image in pictures.values()]))
@@ -137,14 +128,13 @@ def by_path_replay(scene: Scene, rate: float, seconds: float) -> tuple[np.ndarra
             density = _resize(value, shape)
             view = int(order.choice(chosen))
             replay.set_density(density.detach())
-            _, (gradient,) = replay.gradients(
+            gradient = replay.gradient(
                 lambda image: drjit.mean(drjit.square(image - wanted[view]), axis=None),  # noqa: B023
-                [replay.name(DENSITY)],
                 iteration,
                 STEP_PATHS,
                 view,
             )
-            density.backward(replay.by_density(gradient, density.detach()) / power)
+            density.backward(gradient / power)
             adam.step()
             adam.zero_grad()
             with torch.no_grad():

@@ -21,8 +21,10 @@ import re
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 STORE = Path(__file__).with_suffix(".json")
@@ -32,10 +34,8 @@ COMMANDS = {
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
     "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
     "thick": "python benchmarks/accuracy.py thick",
-    "layers": "python benchmarks/dial.py --only step,half,slab,phantom",
-    "boxes": "python benchmarks/dial.py --only box",
+    "layers": "python benchmarks/dial.py",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
-    "rounds": "python benchmarks/speed.py rounds",
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
@@ -45,7 +45,6 @@ COMMANDS = {
     "engines": "python benchmarks/speed.py engines",
     "tangents": "python benchmarks/speed.py tangents",
     "launches": "python benchmarks/launches.py --as-a-gpu --engines warp",
-    "solvers": "python benchmarks/speed.py solvers",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
     "gpu": "python benchmarks/gpu_check.py speed",
@@ -54,21 +53,20 @@ COMMANDS = {
     "hard": "ddrecon bench --hard",
     "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
     "uncertainty": "python benchmarks/uncertainty.py --references FOLDER",
-    "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
     "pyshdom": "python benchmarks/pyshdom.py FOLDER/pyshdom",
     "mouse": "python benchmarks/mouse.py FOLDER/mouse",
 }
 """By the name of a figure, what prints it."""
-KEPT_BY_THEMSELVES = ("fig10", "paper")
-"""Scripts that keep their tables: the paper's, of one experiment or of all."""
+KEPT_BY_THEMSELVES = ("paper",)
+"""Scripts that keep their tables."""
 COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb", "mouse": "mouse"}
 """Figures of what licenses keep out of here, and its place in FOLDER: measured where it is."""
 SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
     ("the same, worst", "eleven", "worst", "default"),
     ("the same by diffusion alone (`transport_rounds: 0`): mean error", "eleven", "mean", "n = 0"),
-    ("the plume above: held-out PSNR", "plume", "as the config has it", "held out"),
+    ("the plume of the two commands: held-out PSNR", "plume", "as the config has it", "held out"),
     ("relative L1 error of its density", "plume", "as the config has it", "L1"),
     ("seconds of the whole process", "plume", "as the config has it", "seconds"),
     (
@@ -93,6 +91,36 @@ SUMMARY = (
 )
 """The README's table: what it says, and the figure, row and column that say it."""
 PLACE = re.compile(r"(<!-- figure: (\w+) -->\n).*?(<!-- end of figure -->)", re.DOTALL)
+
+
+class Used(NamedTuple):
+    """Seconds of a process, those of processors, and its largest memory [MiB]."""
+
+    seconds: float
+    processor: float
+    memory: float
+
+
+def run(command: Sequence[str | Path], folder: Path | None = None) -> Used:
+    """What `command` takes, run in `folder`; raises SystemExit where it fails."""
+    start = time.perf_counter()
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    if status:
+        words = " ".join(map(str, command))
+        raise SystemExit(f"{words}: exit {os.waitstatus_to_exitcode(status)}")
+    return Used(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+def ddrecon(*arguments: str | Path, folder: Path | None = None) -> Used:
+    """What a command of ours takes, run in `folder`, over what it left there."""
+    return run([sys.executable, "-m", "ddrecon", *arguments, "-q", "--overwrite"], folder)
+
+
+def as_options(overrides: Sequence[str]) -> list[str]:
+    """`overrides` as a command takes them."""
+    return [word for override in overrides for word in ("-D", override)]
 
 
 def read_store() -> dict[str, Any]:
@@ -208,7 +236,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
-    parser.add_argument("--show", choices=[*COMMANDS])
+    parser.add_argument("--show", choices=sorted({*COMMANDS, *read_store()}))
     given = parser.parse_args()
     if given.show:
         print(show(given.show, read_store()))

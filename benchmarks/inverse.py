@@ -20,15 +20,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from figures import print_header, print_row
+from figures import as_options, ddrecon, print_header, print_row
 from inverse_scenes import BUILDERS, perspective, render_views
 from pyshdom import write_scene
 from reconstruction import ROOT, coarsened
@@ -175,15 +173,8 @@ def render_anew(scene: Path, run: Path) -> list[float]:
 
 def measure(task: Task, run: Path, options: list[str]) -> Row:
     """Reconstructs `task` in the folder `run`; raises SystemExit where that fails."""
-    command = [sys.executable, "-m", "ddrecon", "optimize", task.scene.name, "-o", str(run), "-q"]
-    start = time.perf_counter()
-    process = subprocess.Popen(
-        [*command, "--overwrite", *task.options, *options], cwd=task.scene.parent
-    )
-    _, status, used = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - start
-    if status:
-        raise SystemExit(f"{task.scene}: exit {os.waitstatus_to_exitcode(status)}")
+    command = ["optimize", task.scene.name, "-o", run, *task.options, *options]
+    used = ddrecon(*command, folder=task.scene.parent)
     place = run / task.frame
     summary = json.loads((place / "summary.json").read_text())
     row = errors_of(task, place) | {"iterations": [summary["iterations"]]}
@@ -191,8 +182,7 @@ def measure(task: Task, run: Path, options: list[str]) -> Row:
         row["held out [dB]"] = [summary["test_psnr"]]
     if task.scene.parent != ROOT / "configs":
         row["anew [dB]"] = render_anew(task.scene, place)
-    row |= {"seconds": [seconds], "of processor": [used.ru_utime + used.ru_stime]}
-    return row | {"memory [MiB]": [used.ru_maxrss / 1024]}
+    return row | {name: [x] for name, x in zip([*COLUMNS][-3:], used, strict=True)}
 
 
 def main() -> None:
@@ -205,7 +195,7 @@ def main() -> None:
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     folder = (given.output or Path(tempfile.mkdtemp())).resolve()
-    options = [word for key in given.keys for word in ("-D", key)]
+    options = as_options(given.keys)
     print_header("scene", *COLUMNS)
     for name in given.only:
         references = given.references and given.references.resolve()

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import ddrecon
 from numpy.typing import NDArray
 from reconstruction import coarsened
 
@@ -80,9 +79,7 @@ def render_views(scene: Path) -> list[Array]:
 
     They are those of a process of its own: what this one takes would count as memory of its runs.
     """
-    words = [sys.executable, "-m", "ddrecon", "render", scene.name, "-o", "images", "-q"]
-    words.append("--overwrite")
-    subprocess.run(words, cwd=scene.parent, check=True, stdout=subprocess.DEVNULL)
+    ddrecon("render", scene.name, "-o", "images", folder=scene.parent)
     names = [view["name"] for view in json.loads(scene.read_text())["views"]]
     return [np.load(scene.parent / "images" / f"{name}.npy") for name in names]
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import print_header, print_row
+from figures import ddrecon, print_header, print_row
 
 LAYERS = ((0, 2), (2, 4), (4, 8), (8, 12), (12, 20))
 """Depths below the skin [mm]."""
@@ -103,10 +103,7 @@ def render_fluence(
         "views": [{"name": "top", "camera": camera}],
     }
     (folder / "mouse.yaml").write_text(json.dumps(scene))  # JSON is YAML
-    command = ["ddrecon", "render", "mouse.yaml", "-o", "out", "--fluence", "-q"]
-    start = time.perf_counter()
-    subprocess.run(command, cwd=folder, check=True)
-    seconds = time.perf_counter() - start
+    seconds = ddrecon("render", "mouse.yaml", "-o", "out", "--fluence", folder=folder).seconds
     fluence = np.load(folder / "out" / "volumes" / "fluence.npz")["fluence"]
     return fluence.transpose(2, 1, 0), seconds
 

@@ -3,56 +3,253 @@ pictures, rewrites the table.
 
     python benchmarks/paper.py [NAME]... [-o FOLDER] [--keep]
 
-NAME is that of a config in configs/paper; without one, all are remade, Fig. 7 and 8 too where
-Mitsuba can run. `--keep` draws finished runs again.
+NAME is that of a config in configs/paper; without one, all are remade, Fig. 8 too where Mitsuba can
+run. `--keep` draws finished runs again.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import paper_gradients
-import paper_path_replay
-import path_replay
-from figures import keep, read_store
+import torch
+import yaml
+from figures import as_options, ddrecon, keep, read_store
 from paper_figures import (
     CONFIGS,
     PICTURES,
     ROOT,
     SHAPES,
+    Array,
     Log,
-    as_options,
-    ddrecon,
+    Pair,
     draw,
     pace,
+    project,
     read_log,
 )
-from paper_shown import (
-    Run,
-    Runs,
-    Shown,
-    draw_parts,
-    draw_rounds,
-    first,
-    show_density,
-    show_derivatives,
-    show_four,
-    show_light,
-    show_optics,
-    show_photograph,
-    show_smoke,
-)
+
+from ddrecon.grid import Grid
+from ddrecon.io.images.table import read_image
+from ddrecon.io.volumes.table import read_field
+from ddrecon.medium.coefficients import resample
 
 TOP = (
     "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | "
     "loss | PSNR shown, novel | found |",
     "|---|---|---|---|---|---|---|",
 )
+
+
+NAMES_13 = {
+    "default": "default",
+    "one_round": "one round",
+    "half": "half the cells, default",
+    "half_one_round": "half the cells, one round",
+    "half_printed": "half the cells, printed",
+}
+TOP_13 = [
+    "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the "
+    "lowest third | density there, in truth 1 |",
+    "|---|---|---|---|---|---|---|",
+]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run in `folder`."""
+
+    folder: Path
+
+    def field(self, name: str) -> Array:
+        """The reconstructed field `name` [z, y, x] or [z, y, x, 3]."""
+        return read_field(self.folder / "volumes" / f"{name}.npz", name).values
+
+    def number(self, name: str) -> float | list[float]:
+        """The found number, or color, of that name."""
+        found: float | list[float] = json.loads((self.folder / "parameters.json").read_text())[name]
+        return found
+
+    def view(self, name: str, title: str) -> Pair:
+        """The view `name`, as the scene has it and as rendered."""
+        scene = yaml.safe_load((self.folder / "scene.yaml").read_text())
+        (image,) = (view.get("image") for view in scene["views"] if view["name"] == name)
+        ours = read_image(self.folder / "views" / f"{name}.npy").pixels
+        return Pair(title, None if image is None else read_image(self.folder / image).pixels, ours)
+
+
+Runs = Mapping[str, Run]
+Shown = Callable[[Runs], tuple[list[Pair], str]]
+
+
+def first(runs: Runs) -> Run:
+    """The first of `runs`, the one the table tells of."""
+    return next(iter(runs.values()))
+
+
+def shape(name: str, like: Array, field: str = "density") -> Array:
+    """A field of the true volume `name`, in cells as small as those of `like` [z, y, x, ...]."""
+    values = read_field(SHAPES / f"{name}.npz", field)
+    grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))
+    found = torch.from_numpy(values.values)
+    moved = found if found.ndim == 3 else found.movedim(-1, 0)
+    carried = resample(moved, grid)
+    return (carried if found.ndim == 3 else carried.movedim(0, -1)).numpy()
+
+
+def relative_l1(ours: Array, truth: Array) -> float:
+    """The relative L1 error."""
+    return float(np.abs(ours - truth).sum() / truth.sum())
+
+
+def densities(run: Run, truth: Array) -> list[Pair]:
+    """Density seen from the front and from the side, and its middle slice, beside `truth`."""
+    ours = run.field("density")
+    pairs = [
+        Pair(f"density along {name}", project(truth, axis, 1), project(ours, axis, 1))
+        for axis, name in ((0, "z"), (2, "x"))
+    ]
+    middle = truth.shape[0] // 2
+    return [*pairs, Pair("density, middle slice", truth[middle, ::-1], ours[middle, ::-1])]
+
+
+def show_density(truth: str, front: str) -> Shown:
+    """What to show of a run that looks for the density of the shape `truth` and was shown the view
+    `front`.
+    """
+
+    def shown(runs: Runs) -> tuple[list[Pair], str]:
+        run = first(runs)
+        density = shape(truth, run.field("density"))
+        pairs = [
+            run.view(front, "a view it was shown"),
+            run.view("novel", "novel view"),
+            *densities(run, density),
+        ]
+        return (
+            pairs,
+            f"relative L1 error of the density {relative_l1(run.field('density'), density):.2f}",
+        )
+
+    return shown
+
+
+def draw_rounds(runs: Runs) -> None:
+    """Fig. 13 by other models: a picture of the densities, and a table."""
+    lines, pairs = [*TOP_13], []
+    for name, run in runs.items():
+        density, log = run.field("density"), read_log(run.folder)
+        true, title = shape("bunny", density), f"{NAMES_13[name]}:\ndensity along x"
+        pairs.append(Pair(title, project(true, 2, 1), project(density, 2, 1)))
+        low = slice(0, len(density[0]) // 3)
+        cells = [NAMES_13[name], len(log["loss"]), f"{log['seconds'][-1]:.0f}"]
+        cells += [f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"]
+        cells += [f"{relative_l1(density, true):.3f}"]
+        cells += [f"{relative_l1(density[:, low], true[:, low]):.2f}"]
+        cells += [f"{density[:, low].sum() / true[:, low].sum():.2f}"]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    draw(PICTURES / "fig13_rounds.png", pairs, {})
+    keep("fig13", "python benchmarks/paper.py fig13", lines)
+
+
+def show_light(runs: Runs) -> tuple[list[Pair], str]:
+    """The bunny, and the color of its light."""
+    run = first(runs)
+    words = (
+        f"irradiance {round_values(run.number('lights.0.irradiance'))}, in truth [3.2, 2.1, 1.2]"
+    )
+    return [run.view("front", "the view it was shown"), run.view("novel", "novel view")], words
+
+
+def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
+    """What each part of the derivative leads to."""
+    pairs = [
+        run.view(view, f"{name}: {view} view")
+        for name, run in runs.items()
+        for view in ("front", "novel")
+    ]
+    losses = {name: read_log(run.folder)["loss"] for name, run in runs.items()}
+    return pairs, "last loss " + ", ".join(
+        f"{name} {loss[-1]:.2g}" for name, loss in losses.items()
+    )
+
+
+def show_optics(runs: Runs) -> tuple[list[Pair], str]:
+    """Absorption and scattering coefficients in the middle of the cloud, and g."""
+    run = first(runs)
+    fields = {name: run.field(name) for name in ("sigma_a", "sigma_s")}
+    density = shape("cloud", fields["sigma_a"])[..., None]
+    truths = [density * shape("cloud", field, name) for name, field in fields.items()]
+    ours = [density * field for field in fields.values()]
+    pairs, errors = compare_optics(truths, ours, middle, "middle slices")
+    alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
+    words = f"g {run.number('g'):.3f}{alone}, in truth -0.802; {errors}"
+    views = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
+    return [*views, *pairs], words
+
+
+def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
+    """The colored smoke, and its coefficients along z."""
+    run, names = first(runs), ("sigma_a", "sigma_s")
+    density = run.field("density")
+    true = shape("smoke", density)[..., None]
+    truths = [true * shape("smoke", density, name) for name in names]
+    ours = [density[..., None] * run.field(name) for name in names]
+    pairs, errors = compare_optics(truths, ours, lambda field: project(field, 0, 1), "along z")
+    views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
+    return [*views, *pairs], errors
+
+
+def compare_optics(
+    truths: Sequence[Array], ours: Sequence[Array], flatten: Callable[[Array], Array], words: str
+) -> tuple[list[Pair], str]:
+    """Absorption of red and scattering of green, flattened, and errors of both in all colors."""
+    pairs = [
+        Pair(
+            f"{title}, {words}", *(flatten(fields[index][..., index]) for fields in (truths, ours))
+        )
+        for index, title in enumerate(("absorption, red", "scattering, green"))
+    ]
+    errors = ", ".join(f"{relative_l1(o, t):.2f}" for o, t in zip(ours, truths, strict=True))
+    return pairs, f"relative L1 error of absorption and scattering {errors}"
+
+
+def show_four(runs: Runs) -> tuple[list[Pair], str]:
+    """The smoke from all four sides, and from one that nobody knows."""
+    run = first(runs)
+    return [
+        run.view(name, name) for name in ("front", "right", "back", "left", "novel")
+    ], "no true volume"
+
+
+def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
+    """The cloud, and what was found of its light."""
+    run = first(runs)
+    names = ("lights.0.irradiance", "lights.0.direction", "lights.1.radiance", "sigma_a", "sigma_s")
+    words = "; ".join(f"{name} {round_values(run.number(name))}" for name in names)
+    return [run.view("front", "the photograph"), run.view("novel", "novel view")], words
+
+
+def middle(field: Array) -> Array:
+    """The mean of the four slices of `field` [z, y, x] in the middle across z, y upwards."""
+    half = field.shape[0] // 2
+    mean: Array = field[half - 2 : half + 2, ::-1].mean(0)
+    return mean
+
+
+def round_values(values: float | list[float]) -> str:
+    """Numbers to three digits."""
+    return (
+        f"{values:.3g}"
+        if isinstance(values, float)
+        else f"[{', '.join(f'{value:.3g}' for value in values)}]"
+    )
 
 
 @dataclass(frozen=True)
@@ -92,7 +289,8 @@ EXPERIMENTS = {
     "fig10": Experiment(show_optics, others={"g_alone": G_ALONE}),
     "fig12_single": Experiment(show_smoke),
     "fig12_four": Experiment(show_four),
-    "fig09": Experiment(show_derivatives, PARTS, draw_more=draw_parts),
+    "fig07": Experiment(show_density("cloud", "front")),
+    "fig09": Experiment(show_derivatives, PARTS),
     "fig14": Experiment(show_photograph),
 }
 """By their configs, in the order of docs/experiments.md."""
@@ -132,19 +330,6 @@ def remake(name: str, output: Path, is_kept: bool) -> str:
     return row(name, read_log(first(runs).folder), words)
 
 
-def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
-    """Fig. 8, where Mitsuba is installed, and where its path replay can run Fig. 7."""
-    if find_spec("mitsuba") is None:
-        print("fig07 and fig08 left out, they need Mitsuba 3: pip install ddrecon[reference]")
-        return
-    if "fig08" in names:
-        paper_gradients.remake(output / "fig08")
-    if "fig07" in names and (lacking := path_replay.why_not()):
-        print(f"fig07 left out, it {lacking}; fig08 is without path replay")
-    elif "fig07" in names:
-        paper_path_replay.remake(output / "fig07", is_kept=is_kept)
-
-
 def main() -> None:
     """Runs, draws and tabulates the named experiments, or all."""
     parser = argparse.ArgumentParser(
@@ -164,7 +349,8 @@ def main() -> None:
             print(rows[name], flush=True)
     lines = [*TOP, *(rows[name] for name in EXPERIMENTS if name in rows)]
     keep("paper", "python benchmarks/paper.py", lines)
-    remake_replay(names, given.output, given.keep)
+    if "fig08" in names and find_spec("mitsuba"):
+        paper_gradients.remake(given.output / "fig08")
 
 
 if __name__ == "__main__":

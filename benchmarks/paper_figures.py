@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -48,17 +47,6 @@ class Pair:
     def white(self) -> float:
         """The value shown brightest."""
         return max(float(np.quantile(self.ours if self.truth is None else self.truth, 0.999)), 1e-6)
-
-
-def ddrecon(*arguments: str | Path) -> None:
-    """Runs a command, quietly."""
-    command = ["ddrecon", *arguments, "-q", "--overwrite"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-def as_options(overrides: Sequence[str]) -> list[str]:
-    """`overrides` as a command takes them."""
-    return [part for override in overrides for part in ("-D", override)]
 
 
 def read_log(run: Path) -> Log:
@@ -99,20 +87,6 @@ def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
     save(figure, path)
 
 
-def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
-    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter,
-    blue where darker, each to a scale.
-    """
-    figure, axes = plt.subplots(
-        1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained"
-    )
-    for axis, (title, image) in zip(axes, images, strict=True):
-        full = float(np.quantile(np.abs(image), 0.999))
-        show_signed(axis, image, full, title)
-        axis.set_xlabel(f"to {full:.2g}", fontsize=7)
-    save(figure, path)
-
-
 def show_signed(axis: Any, values: Array, full: float, title: str) -> None:
     """Draws a signed map on `axis`: white is 0, red is `full`, blue minus that."""
     axis.imshow(values, cmap="RdBu_r", vmin=-full, vmax=full)
@@ -150,7 +124,7 @@ def show(axis: Any, values: Array | None, white: float, colors: str = "viridis")
     if values is None:
         axis.axis("off")
     elif values.ndim == 3:
-        axis.imshow(srgb.encode(np.clip(values / white, 0, 1)))
+        axis.imshow(encode(np.clip(values / white, 0, 1)))
     else:
         axis.imshow(values, cmap=colors, vmin=0, vmax=white)
 

@@ -13,14 +13,12 @@ import argparse
 import json
 import math
 import pickle
-import subprocess
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import print_header, print_row
+from figures import as_options, ddrecon, print_header, print_row
 
 CLOUD = "synthetic_cloud_fields/jpl_les/rico32x37x26.txt"
 PICTURES = "vadim/experiments/LES_cloud_field_rico/monochromatic/measurements"
@@ -140,8 +138,7 @@ def write_scene(copy: Path, folder: Path) -> None:
 
 def image_errors(folder: Path, overrides: list[str]) -> list[float]:
     """How far each of our pictures of the true cloud is from theirs."""
-    command = ["ddrecon", "render", "true.yaml", "-o", "images", "-q", "--overwrite", *overrides]
-    subprocess.run(command, cwd=folder, check=True)
+    ddrecon("render", "true.yaml", "-o", "images", *overrides, folder=folder)
     errors = []
     for path in sorted(folder.glob("view_?.npy")):
         theirs, ours = np.load(path), np.load(folder / "images" / path.name)
@@ -151,10 +148,7 @@ def image_errors(folder: Path, overrides: list[str]) -> list[float]:
 
 def reconstruct(folder: Path, name: str, overrides: list[str]) -> tuple[float, float, float]:
     """L1 and mass of the extinction found, against the true one, and seconds of the process."""
-    command = ["ddrecon", "optimize", "sought.yaml", "-o", name, "-q", "--overwrite", *overrides]
-    start = time.perf_counter()
-    subprocess.run(command, cwd=folder, check=True)
-    seconds = time.perf_counter() - start
+    seconds = ddrecon("optimize", "sought.yaml", "-o", name, *overrides, folder=folder).seconds
     true = np.load(folder / "cloud.npz")["density"]
     found = np.load(folder / name / "volumes" / "density.npz")["density"]
     if name == MASKED:
@@ -172,14 +166,13 @@ def main() -> None:
     folder = given.output or Path(tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
     write_scene(given.copy, folder)
-    overrides = [word for key in given.keys for word in ("-D", key)]
+    overrides = as_options(given.keys)
     print_header("what", "pyshdom", "ours")
     errors = image_errors(folder, overrides)
     print_row("pictures of the true cloud: mean error", "", f"{np.mean(errors):.3f}")
     print_row("the same, worst of nine", "", f"{max(errors):.3f}")
     for name, keys in RUNS.items():
-        chosen = [word for key in keys for word in ("-D", key)]
-        found = reconstruct(folder, name, [*chosen, *overrides])
+        found = reconstruct(folder, name, [*as_options(keys), *overrides])
         theirs = THEIRS if name == MASKED else ("", "", "")
         for what, form, score, ours in zip(SCORES, FORMS, theirs, found, strict=True):
             print_row(f"{name.replace('_', ' ')}: {what}", score, format(ours, form))

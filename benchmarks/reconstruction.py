@@ -12,16 +12,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import subprocess
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import print_header, print_row
+from figures import Used, as_options, ddrecon, print_header, print_row
 
 from ddrecon.io.volumes.table import read_field
 
@@ -56,10 +53,7 @@ def optimize(
     config: str, folder: Path, options: Sequence[str] = ()
 ) -> tuple[dict[str, Any], float]:
     """The summary of a run in `folder`, and the seconds of its process."""
-    command = ["ddrecon", "optimize", str(ROOT / f"configs/{config}.yaml"), "-o", str(folder)]
-    start = time.perf_counter()
-    subprocess.run([*command, "-q", "--overwrite", *options], check=True)
-    seconds = time.perf_counter() - start
+    seconds = ddrecon("optimize", ROOT / f"configs/{config}.yaml", "-o", folder, *options).seconds
     return json.loads((folder / "summary.json").read_text()), seconds
 
 
@@ -156,16 +150,10 @@ def print_capture(folder: Path) -> None:
     print_row("seconds of the process", "", f"{seconds:.0f}")
 
 
-def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], float, float]:
-    """What `film.json` says of the film in `folder`; seconds and peak memory [MiB] of its run."""
-    config, start = str(ROOT / "configs/film.yaml"), time.perf_counter()
-    command = ["ddrecon", "optimize", config, "-o", str(folder), "-q", "--overwrite", *options]
-    run = subprocess.Popen(command)
-    _, status, used = os.wait4(run.pid, 0)
-    if status:
-        raise SystemExit(f"{folder}: exit {os.waitstatus_to_exitcode(status)}")
-    seconds = time.perf_counter() - start
-    return json.loads((folder / "film.json").read_text()), seconds, used.ru_maxrss / 1024
+def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], Used]:
+    """What `film.json` says of the film in `folder`, and what its run took."""
+    used = ddrecon("optimize", ROOT / "configs/film.yaml", "-o", folder, *options)
+    return json.loads((folder / "film.json").read_text()), used
 
 
 def calibration_errors(values: dict[str, Any], number: int) -> dict[str, float]:
@@ -197,13 +185,10 @@ def flicker(folder: Path, numbers: Sequence[int]) -> float:
 def print_film(folder: Path) -> None:
     """Reconstructs the first frames of the film, and the last of them alone from nothing."""
     last, number = f"0:{FRAMES - 1}", FRAMES - 1
-    film, seconds, memory = run_film(folder / "film", "--frames", last)
-    only = [
-        f"frames.{key}={value}"
-        for key, value in (("first", number), ("last", number), ("calibrate", 0))
-    ]
-    options = [word for text in only for word in ("-D", text)]
-    alone, seconds_alone, memory_alone = run_film(folder / "alone", *options)
+    film, used = run_film(folder / "film", "--frames", last)
+    only = {"first": number, "last": number, "calibrate": 0}
+    keys = as_options([f"frames.{key}={value}" for key, value in only.items()])
+    alone, used_alone = run_film(folder / "alone", *keys)
     one, other = film["frames"][-1], alone["frames"][-1]
     print_header("what", "five frames of the film", "the last of them alone")
     for what, key in (("held out", "test_psnr"), ("the same, registered", "registered_psnr")):
@@ -212,8 +197,9 @@ def print_film(folder: Path) -> None:
     print_row(
         "seconds of a frame, later ones", f"{np.mean(in_film):.1f}", f"{other['seconds']:.1f}"
     )
-    print_row("seconds of the process", f"{seconds:.0f}", f"{seconds_alone:.0f}")
-    print_row("most memory of the process [MiB]", f"{memory:.0f}", f"{memory_alone:.0f}")
+    both = used, used_alone
+    print_row("seconds of the process", *(f"{taken.seconds:.0f}" for taken in both))
+    print_row("most memory of the process [MiB]", *(f"{taken.memory:.0f}" for taken in both))
     values = json.loads((folder / f"alone/frames/{number:04d}/parameters.json").read_text())
     errors = calibration_errors(film["values"], number), calibration_errors(values, number)
     for what in errors[0]:

@@ -10,7 +10,6 @@ against its deviation. What FOLDER/uncertainty does not hold of pictures is trac
 from __future__ import annotations
 
 import argparse
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,13 +18,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from figures import print_header, print_row
+from figures import ddrecon, print_header, print_row
 from torch import Tensor
 
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import resample, scene_at_level
+from ddrecon.medium.coefficients import resample
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.uncertainty.experiments import EMPTY, Uncertainty, mean_around
@@ -73,28 +73,11 @@ def trace_ball(folder: Path) -> Known:
 def with_traced(scene: Scene, truth: Path, folder: Path) -> Scene:
     """`scene` with pictures of the scene file `truth`, which `folder` keeps."""
     if not (folder / "reference.json").is_file():
-        command = ["ddrecon", "reference", truth, "-o", folder, "--overwrite", "--views", "-q"]
-        subprocess.run([*map(str, command), "--spp", str(PATHS)], check=True, capture_output=True)
+        ddrecon("reference", truth, "-o", folder, "--views", "--spp", str(PATHS))
     images = {v.name: np.load(folder / f"{v.name}.npy").transpose(2, 0, 1) for v in scene.views}
     return replace(
         scene, views=[replace(v, image=torch.tensor(images[v.name])) for v in scene.views]
     )
-
-
-def finish(scene: Scene) -> Reconstruction:
-    """A run of `scene`, at its end."""
-    run = Reconstruction(scene)
-    while not run.is_done:
-        run.step()
-    return run
-
-
-def experiment(run: Reconstruction, experiments: int) -> Uncertainty:
-    """So many `experiments` about `run`, made."""
-    found = Uncertainty(run, seed=0)
-    while found.count < experiments:
-        found.step()
-    return found
 
 
 def judge(known: Known, experiments: int) -> dict[str, Any]:
@@ -104,8 +87,12 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
     errors in the cells around.
     """
     scene, truth = known
-    run = finish(scene)
-    deviations = experiment(run, experiments)
+    run = Reconstruction(scene)
+    while not run.is_done:
+        run.step()
+    deviations = Uncertainty(run, seed=0, wanted=experiments)
+    while not deviations.is_done:
+        deviations.step()
     field, truth = deviations.fields()["density"], resample(truth, run.level.train.volume.grid)
     smoke, error = truth > EMPTY * truth.max(), (field.value - truth).abs()
     row: dict[str, Any] = {"cells": int(smoke.sum())}

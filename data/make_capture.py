@@ -33,7 +33,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
-from ddrecon.pictures.srgb import encode
+from ddrecon.pictures import encode
 from ddrecon.reference.trace import Tracer, open_tracer
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings

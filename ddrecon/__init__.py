@@ -17,7 +17,7 @@ _HOMES = {
     "VolumeRenderer": "layer",
     "optimize": "reconstruct.loop",
     "show": "report.volumes",
-    "optimize_sequence": "film.drive",
+    "optimize_sequence": "film",
     "Result": "reconstruct.frame",
     "Scene": "scene",
     "use_engine": "engine",
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ddrecon.errors import SceneError as SceneError
     from ddrecon.errors import SolveError as SolveError
     from ddrecon.errors import UsageError as UsageError
-    from ddrecon.film.drive import optimize_sequence as optimize_sequence
+    from ddrecon.film import optimize_sequence as optimize_sequence
     from ddrecon.layer import VolumeRenderer as VolumeRenderer
     from ddrecon.layer import fluence as fluence
     from ddrecon.layer import render as render

@@ -7,7 +7,6 @@ tracing by Mitsuba 3, where that is installed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,8 +23,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.picture import render_each
 from ddrecon.progress import Progress, table_lines
-from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
+from ddrecon.reconstruct.setup import scene_at_level
+from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import plume_scene, relative_error
 from ddrecon.variables.values import with_values
@@ -37,8 +36,9 @@ TRUTH_PASSES, TRUTH_SEED = 4, 1000
 """The truth is the mean of so many images of the most paths, whose seeds begin here."""
 QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
-HEAD: tuple[str, ...] = ("variant", "image s", "+ gradient s", "times base", "iterations")
-HEAD += ("image num. error", "gradient num. error", "image error", "")
+COLUMNS = {"name": "", "image_seconds": ".3f", "both_seconds": ".3f", "times_base": ".2f"}
+COLUMNS |= {"iterations": "", "image_numerical": ".1e", "gradient_numerical": ".1e"}
+COLUMNS |= {"image_error": ""}
 
 
 @dataclass(frozen=True)
@@ -73,28 +73,26 @@ def load_pair(
 
 def variants_of(scene: Scene, is_quick: bool) -> dict[str, Scene]:
     """`scene` by name: as it is, then by other settings, one at a time; fewer if it `is_quick`."""
-    changes: dict[str, tuple[str, dict[str, Any]]] = {"base": ("render", {})}
-    for tolerance in (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6):
-        changes[f"tolerance {tolerance}"] = "diffusion", {"tolerance": tolerance}
-    for closure in CLOSURES:
-        changes[f"closure {closure}"] = "diffusion", {"closure": closure}
-    changes["rounds by the medium"] = "diffusion", {"transport_rounds": None}
-    for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
-        change = {"transport_rounds": rounds, "degree": degree}
-        changes[f"rounds {rounds}, degree {degree}"] = "diffusion", change
-    for steps in (1, 2):
-        changes[f"steps {steps}"] = "render", {"steps_per_voxel": steps}
+    exactness = (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+    rounds = (0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))
+    changes: dict[str, dict[str, Any]] = {"rounds by the medium": {"transport_rounds": None}}
+    changes |= {f"tolerance {tolerance}": {"tolerance": tolerance} for tolerance in exactness}
+    changes |= {f"closure {closure}": {"closure": closure} for closure in CLOSURES}
+    for count, degree in rounds:
+        change = {"transport_rounds": count, "degree": degree}
+        changes[f"rounds {count}, degree {degree}"] = change
+    of_rays: dict[str, dict[str, Any]] = {f"steps {n}": {"steps_per_voxel": n} for n in (1, 2)}
     for tolerance in (0, 0.05) if is_quick else (0, 0.01, 0.05, 1):
-        changes[f"pixels {tolerance}"] = "render", {"tolerance": tolerance}
+        of_rays[f"pixels {tolerance}"] = {"tolerance": tolerance}
     variants = {
-        name: replace(scene, **{section: replace(getattr(scene, section), **change)})
-        for name, (section, change) in changes.items()
+        n: replace(scene, diffusion=replace(scene.diffusion, **changes[n])) for n in changes
     }
+    variants |= {n: replace(scene, render=replace(scene.render, **of_rays[n])) for n in of_rays}
     for factor in (2,) if is_quick else (2, 4):
         coarse = replace(scene_at_level(scene, factor), views=scene.views)
         variants[f"grid {factor} times coarser"] = coarse
     base = _settings(scene)
-    return {n: v for n, v in variants.items() if n == "base" or _settings(v) != base}
+    return {"base": scene} | {n: v for n, v in variants.items() if _settings(v) != base}
 
 
 def _settings(scene: Scene) -> tuple[object, ...]:
@@ -118,15 +116,6 @@ def shoot(scene: Scene) -> Shot:
     return Shot(image.detach(), gradient, middle - start, end - middle, iterations)
 
 
-def exact_scene(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
-    marched in finer steps, ray by ray.
-    """
-    marching = replace(scene.render, steps_per_voxel=max(3, scene.render.steps), tolerance=0.0)
-    diffusion = replace(scene.diffusion, tolerance=1e-8, warm_start=False)
-    return replace(scene, render=marching, diffusion=diffusion)
-
-
 def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
     """An image by so many paths a pixel."""
     start = perf_counter()
@@ -142,15 +131,18 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. `is_best`: no
-    other row is known to be faster and as close to the truth.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
     }
     exact, solved = dict[str, Shot](), dict[tuple[object, ...], Shot]()
     for name, variant in progress([*variants_of(double, is_quick).items()], "exact solutions"):
-        as_exact = exact_scene(variant)
+        marching = replace(
+            variant.render, steps_per_voxel=max(3, variant.render.steps), tolerance=0.0
+        )
+        diffusion = replace(variant.diffusion, tolerance=1e-8, warm_start=False)
+        as_exact = replace(variant, render=marching, diffusion=diffusion)
         key = _settings(replace(as_exact, render=double.render))
         if key not in solved:  # alike ones are solved once
             solved[key] = shoot(as_exact)
@@ -164,7 +156,6 @@ def run_bench(
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
-    mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
     return {
         "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
@@ -208,36 +199,16 @@ def row_of(
     }
 
 
-def mark_best(rows: list[dict[str, Any]], noise: float) -> None:
-    """Marks the `rows` that no other beats in both time of an image and error.
-
-    An error against path tracing is at least what the `noise` of that can tell from none.
-    """
-
-    def error(row: dict[str, Any]) -> float:
-        if row["image_error"] is not None:
-            return max(row["image_error"], least_error(noise))
-        return math.inf if row["image_numerical"] is None else row["image_numerical"]
-
-    for row in rows:
-        faster = (other for other in rows if other["image_seconds"] < row["image_seconds"])
-        row["is_best"] = all(error(other) > error(row) for other in faster)
-
-
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """The report as a Markdown table, and Mitsuba's time; times are multiples of the base's."""
-    rows, noise, cells = report["rows"], report["truth_noise"], list[list[str]]()
-    for row in rows:
-        seconds = row["image_seconds"], row["both_seconds"]
-        numerical = row["image_numerical"], row["gradient_numerical"]
-        times = f"{row['both_seconds'] / rows[0]['both_seconds']:.2f}"
-        cells.append([row["name"], *(f"{n:.3f}" for n in seconds), times, str(row["iterations"])])
-        cells[-1] += ["" if error is None else f"{error:.1e}" for error in numerical]
-        cells[-1] += ["" if noise is None else error_text(row["image_error"], noise)]
-        cells[-1] += ["best" if row["is_best"] else ""]
-    lines = table_lines(HEAD, cells)
+    rows, noise, base = list[dict[str, Any]](), report["truth_noise"], report["rows"][0]
+    for row in report["rows"]:
+        times = row["both_seconds"] / base["both_seconds"]
+        error = None if noise is None else error_text(row["image_error"], noise)
+        rows.append(row | {"times_base": times, "image_error": error})
+    lines = table_lines(COLUMNS, rows)
     if noise is not None:
-        times = rows[-1]["image_seconds"] / rows[0]["image_seconds"]
+        times = rows[-1]["image_seconds"] / base["image_seconds"]
         lines.append(
             f"image error is against path tracing, whose noise, {noise:.2g}, is subtracted; "
             f"{rows[-1]['name']} take {times:.3g} times as long as base"

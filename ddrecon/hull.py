@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_max_pool2d, avg_pool2d, max_pool2d, nor
 from ddrecon.cameras import Camera, cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid, array_order
-from ddrecon.pictures.noise import estimate_noise, least_noise
+from ddrecon.pictures import estimate_noise, least_noise
 from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 

@@ -17,11 +17,9 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
-from ddrecon.scene import Scene
-from ddrecon.supported import require_above
+from ddrecon.scene import Scene, require_above
 from ddrecon.variables.kinds import PAIRS
-from ddrecon.variables.legal import require_legal, require_scene
-from ddrecon.variables.values import is_real, shapes_of, with_values
+from ddrecon.variables.values import is_real, require_legal, require_scene, shapes_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""

@@ -18,9 +18,13 @@ from torch import Tensor
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
-from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
+from ddrecon.diffusion.paper import (
+    iterate_jacobi,
+    iterate_picard,
+    solve_flux_limited,
+    solve_printed,
+)
 from ddrecon.diffusion.solve import name_kernels, solve_by_multigrid
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import AmbientLight
@@ -39,9 +43,15 @@ from ddrecon.light.sky import Sky, Source
 from ddrecon.march.faces import receive_at_faces
 from ddrecon.march.ground import LitGround
 from ddrecon.march.periods import HALO
-from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_medium
-from ddrecon.medium.levels import refine_medium, resample
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import (
+    Medium,
+    Volume,
+    keep_medium,
+    refine_medium,
+    remaining_moments,
+    resample,
+    scale_medium,
+)
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.layout import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero

@@ -24,14 +24,12 @@ from ddrecon.light_field import LightField, find_light, fluence_of, medium_of, m
 from ddrecon.march.faces import scatter_back
 from ddrecon.march.ground import light_evenly, light_texels, reflect, upwards
 from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.levels import resample, volume_at_level
+from ddrecon.medium.coefficients import Medium, resample, volume_at_level
 from ddrecon.medium.optics import transmitted_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import Unrolled
-from ddrecon.scene import Scene
-from ddrecon.supported import require_supported
+from ddrecon.scene import Scene, require_supported
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""

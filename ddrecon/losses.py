@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.pictures.noise import Noise
-from ddrecon.pictures.scales import Scale, scale_of, structural_similarity
+from ddrecon.pictures import Noise, Scale, scale_of, structural_similarity
 
 HUBER = 0.05
 """Errors above this share of the target's scale count linearly in the Huber loss."""

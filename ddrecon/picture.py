@@ -11,9 +11,9 @@ from torch import Tensor
 from ddrecon.cameras import Camera, Rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
 from ddrecon.light.reduced import ambient_radiance
+from ddrecon.light.sky import environment_radiance
 from ddrecon.light_field import FaceLight, LightField
 from ddrecon.lighting import send, solve_light
 from ddrecon.march.ground import see_ground

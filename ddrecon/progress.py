@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import Timer
 from typing import Any
@@ -68,6 +68,13 @@ def tell(text: str) -> Iterator[None]:
         timer.cancel()
 
 
-def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A table in Markdown, line by line."""
-    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+def table_lines(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """`rows` as a table in Markdown, of those of their keys that are `columns`.
+
+    `columns` say how each is formatted; what is None, or not there, leaves an empty cell.
+    """
+    lines = [[key.replace("_", " ") for key in columns], ["---"] * len(columns)]
+    for row in rows:
+        values = [(row.get(key), form) for key, form in columns.items()]
+        lines.append(["" if value is None else format(value, form) for value, form in values])
+    return [f"| {' | '.join(cells)} |" for cells in lines]

@@ -1,26 +1,30 @@
 """What a scene is as tensors: a volume, its lights and its views, and the settings of both.
 
+Also what of it is not computed together, in files and in Python, and cameras around its volume.
+
 The physics and the reconstruction read these records; `ddrecon.scene_file` has how they are written
 in a file.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera
+from ddrecon.cameras import Camera, rotation
 from ddrecon.defaults import choose_diffusion, choose_exchanges, find_occupied
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
-from ddrecon.light.lights import Light
+from ddrecon.light.lights import BeamLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
@@ -111,3 +115,100 @@ class Scene:
                 return view
         names = ", ".join(view.name for view in self.views)
         raise UsageError(f"no view {name!r}; the views are {names}")
+
+
+def require_supported(scene: Scene) -> None:
+    """Raises UsageError for what is not computed of `scene`; its line begins with the key."""
+    for problem in _unsupported(scene):
+        raise UsageError(problem)
+
+
+def require_above(scene: Scene) -> None:
+    """Raises UsageError where a camera of `scene` is not above its ground."""
+    if scene.ground is None:
+        return
+    height, up = scene.ground.plane.height, 2 - scene.ground.plane.axis
+    for view in scene.views:
+        if float(view.camera.pose[up, 3]) <= height:
+            raise UsageError(
+                f"ground.height: the camera of view {view.name!r} is not above it along "
+                f"{'xyz'[up]}; volume.up says which axis is up"
+            )
+
+
+def _unsupported(scene: Scene) -> Iterator[str]:
+    settings, grid, ground = scene.diffusion, scene.volume.grid, scene.ground
+    is_printed, is_limited = settings.scheme == "printed", settings.model == "flux_limited"
+    if settings.model != "none":  # whose rounds nobody makes
+        yield from (f"diffusion.{key}: {problem}" for key, problem in settings.violations())
+    if ground is not None:
+        if is_printed:
+            yield "ground: the printed scheme has none; leave diffusion.scheme out"
+        axis, height = ground.plane.axis, ground.plane.height
+        if height > grid.lower[axis]:
+            yield (
+                f"ground.height: {height:g} is above the bottom of the box, {grid.lower[axis]:g} "
+                f"along {'zyx'[axis]}; a ground lies there or below"
+            )
+    if grid.periodic:
+        if is_printed or is_limited:
+            yield "diffusion: volume.periodic is for model p1 with scheme conservative, or none"
+        yield from _unrepeated(scene)
+    refracted = {
+        "ground": ground is not None,
+        "diffusion.scheme: printed": is_printed,
+        "diffusion.model: flux_limited": is_limited,
+        "point lights": any(isinstance(light, PointLight) for light in scene.lights),
+    }
+    for name in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
+        yield f"volume.index: there is none with {name}"
+
+
+def _unrepeated(scene: Scene) -> Iterator[str]:
+    """What there is not in a volume that is periodic."""
+    for number, light in enumerate(scene.lights):
+        if isinstance(light, PointLight | BeamLight):
+            problem = f"a {type(light).__name__} does not repeat as the volume does"
+            yield f"lights.{number}: {problem}; leave volume.periodic out"
+    if scene.ground is not None:
+        axis = scene.ground.plane.axis
+        if axis in scene.volume.grid.periodic:
+            yield f"ground: lies across {'zyx'[axis]}, along which the volume is periodic"
+        if scene.ground.albedo.ndim > 1:
+            yield "ground.albedo: a map does not repeat as the volume does: give a number"
+    if scene.volume.index != 1:
+        yield "volume.index: faces that repeat refract nothing: leave index or periodic out"
+    for name, parameter in scene.optimize.parameters.items() if scene.optimize else ():
+        if parameter.support is not None:
+            key = f"optimize.parameters.{name}.support"
+            yield f"{key}: is for volumes that do not repeat: leave it out"
+
+
+def upright_axis(scene: Scene) -> int:
+    """Which of x, y, z (0, 1, 2) points up in `scene`.
+
+    A scene that does not say has the one nearest to the sum of its cameras' up vectors.
+    """
+    if scene.up is not None:
+        return scene.up
+    upward = torch.stack([view.camera.pose[:, 1] for view in scene.views])
+    return int(upward.sum(0).abs().argmax())
+
+
+def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
+    """`camera` turned by `angle` [rad] about the `axis` (0, 1, 2: x, y, z) through `center`."""
+    middle = camera.pose.new_tensor(center)
+    turn = rotation(angle * torch.eye(3, dtype=torch.float64)[axis]).to(camera.pose)
+    origin = middle + turn @ (camera.pose[:, 3] - middle)
+    return replace(camera, pose=torch.cat([turn @ camera.pose[:, :3], origin[:, None]], 1))
+
+
+def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
+    """`count` >= 1 views, from `view` in equal steps once around the volume of `scene`.
+
+    They are called `ring_000`, which is that of `view`, `ring_001` and so on.
+    """
+    axis, center = upright_axis(scene), scene.volume.grid.center_xyz
+    angles = (2 * math.pi * number / count for number in range(count))
+    cameras = (turn_camera(view.camera, axis, angle, center) for angle in angles)
+    return [View(f"ring_{number:03d}", camera) for number, camera in enumerate(cameras)]

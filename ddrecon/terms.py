@@ -23,10 +23,15 @@ from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.light_field import multiply_scatters
 from ddrecon.lighting import fluence
 from ddrecon.march.samplers import greatest_depth
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.medium.levels import volume_at_level
+from ddrecon.medium.coefficients import (
+    Medium,
+    Volume,
+    backward_fraction,
+    has_backward_peak,
+    scale_medium,
+    volume_at_level,
+)
 from ddrecon.medium.optics import transmitted_moments
-from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
@@ -48,9 +53,10 @@ PART = 8
 """Cells along each side of the part of a volume that tells what thick cells cost."""
 THICKEST, THINNEST = 3e3, 1e-3
 """Optical depths beyond these look like a wall, or like nothing."""
-THICK_FACES, ABSORBING = 2.0, 2.5
+THICK_FACES, ABSORBING, FINEST = 2.0, 2.5, 100.0
 """A cell at a face of extinction k, the forward peak left out, and absorption a is too thick where
-k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/hard_cases.md)."""
+k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/reliability.md).
+Nobody takes cells 100 times smaller."""
 FORWARD = 0.5
 """From this mean cosine on g may be traded for fewer scatterings."""
 SMALLEST = 2.0
@@ -80,11 +86,7 @@ def _find_terms(scene: Scene) -> Iterator[str]:
         yield f"{emission}, {'scattered and seen' if is_diffuse else 'only seen: not scattered'}"
     if volume.index != 1:
         inside = 1 - transmitted_moments(volume.index)[0]
-        outside = ((volume.index - 1) / (volume.index + 1)) ** 2
-        yield (
-            f"refractive index {volume.index:g}: faces reflect {inside:.1%} of diffuse light "
-            f"inside, and {outside:.1%} of light from straight ahead"
-        )
+        yield f"refractive index {volume.index:g}: faces reflect {inside:.1%} of light inside"
     if is_diffuse:
         yield from _diffuse_terms(medium, scene)
     else:
@@ -268,6 +270,7 @@ def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings
     if thickest > THICK_FACES:
         times, g = thickest / THICK_FACES, float(medium.g.max())
         advice = f"take cells {times:.1f} times smaller, and leave a layer of empty ones"
+        advice = advice if times < FINEST else UNITS
         if g >= FORWARD:
             advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
         cells = f"cells at the faces of the box are up to {depth:.3g} optical depths thick"

@@ -1,7 +1,7 @@
 """Small random media, operators, cameras and scenes."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -22,7 +22,7 @@ from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.values import varied, with_values
+from ddrecon.variables.values import value_of, varied, with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -194,6 +194,16 @@ def assert_derivatives(
             for step in (1e-5, -1e-5)
         )
     assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
+
+
+def assert_image_derivatives(scene: Scene, names: Sequence[str], error: float = 1e-5) -> None:
+    """As `assert_derivatives`, of a random sum over the images of `scene`, by its variables."""
+
+    def total(values: dict[str, Tensor]) -> Tensor:
+        image = render(with_values(scene, values))
+        return (image * random_values(*image.shape, seed=1)).sum()
+
+    assert_derivatives(total, {name: value_of(scene, name) for name in names}, error)
 
 
 def count_kept(function: Callable[[], Tensor], least: int) -> int:

@@ -60,7 +60,7 @@ class Tape(TorchDispatchMode):
 
 
 def record(computation: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
-    """As `ddrecon.reconstruct.recording.GraphRecorder`, on a processor."""
+    """As `ddrecon.reconstruct.gradients.GraphRecorder`, on a processor."""
     from ddrecon.kernels import launch  # imports Warp
 
     computation()

@@ -12,13 +12,14 @@ from media import make_camera
 from ddrecon.cameras import (
     Camera,
     cast_rays,
+    distort,
     image_places,
     look_at,
     project,
+    ray_through,
     subpixel_offsets,
     twist,
 )
-from ddrecon.lenses import distort, ray_through
 
 ORIGIN, TARGET, UP = (
     torch.tensor(v, dtype=torch.float64)

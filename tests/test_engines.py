@@ -21,7 +21,7 @@ from twins import (
 
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.layer import VolumeRenderer
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings

@@ -13,8 +13,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import optimize
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names

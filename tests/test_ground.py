@@ -11,7 +11,7 @@ import torch
 from media import (
     LOWER,
     UPPER,
-    assert_derivatives,
+    assert_image_derivatives,
     half_empty,
     light_of,
     make_camera,
@@ -35,11 +35,11 @@ from ddrecon.light.lights import (
     PointLight,
 )
 from ddrecon.light.sky import decompose_map
-from ddrecon.medium.coefficients import Volume
+from ddrecon.march.ground import light_evenly, reflect
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
-from ddrecon.variables.values import value_of, with_values
 
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 SHAPE = (6, 7, 5)
@@ -76,6 +76,16 @@ def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
     expected = tensor(*ALBEDO)[:, None, None] / math.pi * irradiance
     # the beam's radius is a little more: none is thinner than half a cell
     torch.testing.assert_close(render(scene)[0], expected, rtol=1e-7, atol=0)
+
+
+def test_where_no_medium_is_near_a_ground_sends_back_its_part_of_sun_and_sky() -> None:
+    scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0.6, -0.8, 0.0))
+    medium, sources = scale_medium(scene.volume), [*scene.lights, AmbientLight(tensor(0.5))]
+    lit = light_evenly(scene.ground, sources, medium.grid, scene.volume.density)
+    even, more = reflect(lit, medium, scene.render)
+    wanted = tensor(*ALBEDO) / math.pi * (0.8 * scene.lights[0].irradiance + math.pi * 0.5)
+    torch.testing.assert_close(even, wanted)
+    torch.testing.assert_close(more, torch.zeros_like(more), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5])
@@ -184,13 +194,7 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
         scene.lights.append(sky)
     names = "density", "ground.albedo", "lights.0.irradiance", "lights.0.direction"
     names += "lights.1.radiance", "lights.2.position", "lights.3.position", "lights.3.radius"
-    values = {name: value_of(scene, name) for name in names}
-    weights = random_values(1, 3, 6, 7, seed=3)
-
-    def total(changed: dict[str, Tensor]) -> Tensor:
-        return (weights * render(with_values(scene, changed))).sum()
-
-    assert_derivatives(total, values, 1e-4)
+    assert_image_derivatives(scene, names, 1e-4)
 
 
 def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:

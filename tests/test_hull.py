@@ -11,8 +11,7 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.hull import bounds_text, doubt_box
 from ddrecon.picture import render
-from ddrecon.scene import View
-from ddrecon.turntable import place_turntable, turn_camera, upright_axis
+from ddrecon.scene import View, place_turntable, turn_camera, upright_axis
 
 BOX = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.8, 0.5]])
 SMOKE = torch.tensor([[0.1, 0.1, 0.12], [0.4, 0.6, 0.4]])

@@ -8,17 +8,19 @@ from typing import Any
 
 import pytest
 import torch
-from media import assert_derivatives, make_camera, make_scene, random_values, tensor
+from media import assert_image_derivatives, make_camera, make_scene, random_values, tensor
 from torch import Tensor
 
 import ddrecon
 from ddrecon.cameras import Pane
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.optics import face_resistance, reflectance, refract, transmitted_moments
 from ddrecon.scene import Scene, View
+from ddrecon.transport.characteristics import Characteristic
+from ddrecon.transport.rounds import face_mirror
 from ddrecon.validate.balance import find_balance
-from ddrecon.variables.values import value_of, with_values
 
 BEAM = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
 
@@ -100,6 +102,18 @@ def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
     assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
 
 
+def test_before_any_sweep_faces_send_back_the_light_that_is_at_them() -> None:
+    """From cells amid the lower face along z, along all directions that leave it."""
+    scene, light = within(1.4, random_values(3, 4, 5)), torch.zeros(1, 1, 3, 4, 5).double()
+    mirror = face_mirror(scale_medium(scene.volume), 26)
+    light[:, :, 0, 1:-1, 1:-1] = 1
+    mirror.begin(light)
+    for number, direction in enumerate(mirror.directions):
+        axes = Characteristic.of(scene.volume.grid, direction).axes
+        for axis, end in zip(axes, mirror.entering(number), strict=True):
+            assert not direction[axis] or bool(end.any()) == (axis == 0 and direction[0] > 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("light", ["down", "ambient", "beam"])
 def test_no_power_is_lost_or_made(light: str) -> None:
@@ -143,10 +157,4 @@ def test_images_have_tangent_adjoint_and_differences(rounds: dict[str, Any]) -> 
     lights += [f"lights.2.{name}" for name in vars(world.lights[2])]
     cameras = [f"views.{view.name}.camera" for view in views]
     names = ["density", "sigma_a", "sigma_s", "g", *cameras, *lights]
-    values = {name: value_of(world, name) for name in names}
-    weights = random_values(2, 3, *near.size, seed=1)
-
-    def loss(named: dict[str, Tensor]) -> Tensor:
-        return (weights * ddrecon.render(with_values(world, named))).sum()
-
-    assert_derivatives(loss, values)
+    assert_image_derivatives(world, names)

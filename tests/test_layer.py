@@ -20,8 +20,9 @@ from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
 from ddrecon.variables.values import value_of, variable_names, with_values
 
@@ -246,7 +247,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "another number": (lambda: small_layer()(g=0.3), "g: expected a tensor"),
     "twice": (lambda: small_layer()(**TWICE), "density: given twice"),
     "two pairs": (lambda: small_layer()(**TWO_PAIRS), "sigma_a, sigma_t: "),
-    "every view": (lambda: small_layer()(values=ALL_CAMERAS), "as in views.view.camera"),
+    "every view": (lambda: small_layer()(values=ALL_CAMERAS), "did you mean 'views.view.camera'"),
     "no glow": (lambda: small_layer()(values=NO_GLOW), "volume.emission = torch.zeros(1)"),
     "sparse": (lambda: small_layer()(SPARSE), "density: is torch.float32, t"),
     "complex": (lambda: small_layer()(COMPLEX), "density: is torch.complex64, torch"),
@@ -269,7 +270,8 @@ RECORDS: dict[str, list[Any]] = {
     "lights": [[SUN], [None]],
     "views": [[None]],
     "ground": [Ground(tensor(0.5), Plane(NAN, 1)), Ground(tensor(0.5), Plane(-9.0, 7))],
-    "diffusion": [{}],
+    "diffusion": [{}, DiffusionSettings(degree=4), DiffusionSettings(tolerance=NAN)],
+    "render": [RenderSettings(samples_per_pixel=0)],
     "volume.phase": [None],
     "volume.black_body": [2000.0],
     "volume.support": [torch.ones(2, 2, 2)],

@@ -6,8 +6,7 @@ import torch
 from media import random_values
 
 from ddrecon.losses import HUBER, LOSSES, Target
-from ddrecon.pictures import srgb
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise, decode, encode
 
 
 def image_loss(loss: str, image: torch.Tensor, target: torch.Tensor, mask=None, noise=None):
@@ -36,7 +35,7 @@ def test_a_loss_of_radiance_grows_with_the_square_of_all_brightness(loss: str) -
 def test_small_errors_are_those_of_displayed_values() -> None:
     target = torch.linspace(0.0005, 0.99, 60, dtype=torch.float64).view(3, 4, 5)
     error = 1e-6 * torch.linspace(-1, 1, 60, dtype=torch.float64).view(3, 4, 5)
-    shown = srgb.encode((target + error).numpy()) - srgb.encode(target.numpy())
+    shown = encode((target + error).numpy()) - encode(target.numpy())
     found = float(image_loss("display", target + error, target))
     assert found == pytest.approx(np.square(shown).mean(), rel=1e-4)
 
@@ -70,8 +69,8 @@ def test_psnr_has_white_for_its_peak() -> None:
     one = torch.ones(3, 8, 8)
     assert Target.of(one, None).psnr_of(one + 0.01) == pytest.approx(40, abs=1e-3)
     target = torch.full((3, 8, 8), 0.2)
-    shown = float(srgb.encode(np.array(0.2))) + 0.01
-    brighter = torch.full((3, 8, 8), float(srgb.decode(np.array(shown))))
+    shown = float(encode(np.array(0.2))) + 0.01
+    brighter = torch.full((3, 8, 8), float(decode(np.array(shown))))
     found = float(Target.of(target, None, "display").psnr_of(brighter))
     assert found == pytest.approx(40, abs=1e-2)
 

@@ -108,7 +108,7 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
 @pytest.mark.parametrize("kind", KINDS)
 def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
     """The tangent is along both variables; light is followed through few periods."""
-    for room in ("numerics.layout", "march.box"):
+    for room in ("numerics.layout", "march.samplers"):
         monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
     scene = repeated(half_empty(*SHAPE), **KINDS[kind])
     values = values_of(scene, ["density", *(["g"] if KINDS[kind].get("g") else [])])

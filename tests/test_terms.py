@@ -147,6 +147,9 @@ def test_a_thick_face_is_told_by_what_it_costs() -> None:
         medium = f"volume.sigma_a={(1 - albedo) * 1.5 / size}", f"volume.g={g}"
         lines = doubts(*cells, *medium, f"volume.sigma_s={albedo * 1.5 / size}")
         assert words in lines[0] if words else lines == []
+    for huge in ("1e5", "1e38"):  # which no finer grid mends
+        lines = doubts(*cells, "volume.sigma_a=0", "volume.g=0", f"volume.sigma_s={huge}")
+        assert "in the same unit?" in lines[-1] and "times smaller" not in str(lines)
 
 
 def test_a_light_below_the_ground() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from ddrecon.errors import DataWarning, DdreconError
+from ddrecon.errors import DataWarning, DdreconError, UsageError
 from ddrecon.interrupts import INTERRUPTED, interrupt, on_interrupt
 from ddrecon.settings import MOST_AROUND
 
@@ -194,6 +194,14 @@ def _run(function: Callable[..., None], is_shared: bool, values: dict[str, Any])
     with show_warnings():
         if session.report is not None:
             require_folder_of(session.report)
+        sources = values["source"] if isinstance(values["source"], tuple) else [values["source"]]
+        for path in filter(None, sources):
+            try:
+                os.stat(path)
+            except OSError as error:
+                raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+        if session.overwrite and session.resume:
+            raise click.UsageError("--resume goes on with what --overwrite removes: say one")
         if "RANK" in os.environ:  # ranks meet before one of them fails, so that it is told once
             # Where others cannot be reached, one line says so, and not a page of torch's.
             os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")

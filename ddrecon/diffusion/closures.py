@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -35,7 +35,6 @@ GAP, NOTHING = 1.0, 1e-3
 """In a medium that repeats light spreads in gaps of `GAP` times its thickness, of which empty
 layers are so small a part: beyond the medium nothing holds it up.
 """
-
 FLOOR = 3.3
 """Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 
@@ -128,7 +127,11 @@ def _spectrum(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
     for n, step in zip(grid.shape, grid.spacing, strict=True):
         centers = torch.fft.fftfreq(2 * n, 1 / (2 * n * step), dtype=torch.float64)
         corners.append(torch.stack([centers + step / 2, centers - step / 2]))
-    z, y, x = (_along(line, axis) for axis, line in enumerate(corners))
+    # Fields [2, z, 2, y, 2, x] that vary along an axis alone.
+    z, y, x = (
+        line.view(*[1, 1] * axis, *line.shape, *[1, 1] * (2 - axis))
+        for axis, line in enumerate(corners)
+    )
     radius = (z * z + y * y + x * x).sqrt()
     terms = torch.zeros_like(radius)
     for a, b, c in ((z, y, x), (y, x, z), (x, z, y)):
@@ -138,17 +141,7 @@ def _spectrum(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.fft.rfftn(kernel.to(device, dtype))
 
 
-def _along(line: Tensor, axis: int) -> Tensor:
-    """`line` [2, n] as a field [2, z, 2, y, 2, x] that varies along `axis` alone."""
-    shape = [1] * 6
-    shape[2 * axis : 2 * axis + 2] = line.shape
-    return line.view(shape)
-
-
-CLOSURES: dict[str, Callable[[Tensor, Grid], Tensor]] = {
-    "geometric": geometric,
-    "smooth": smooth,
-}
+CLOSURES = {"geometric": geometric, "smooth": smooth}
 
 
 @dataclass(frozen=True)

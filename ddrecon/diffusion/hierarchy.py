@@ -6,9 +6,9 @@ transpose of that before it, restriction that of interpolation, and each relaxat
 error smaller.
 
 Each coarser grid has half the cells along an axis, one axis after another. Conductances are read as
-a network of resistors: cells may be of any form. Along the axis a
-coarse face is half of either pair's inner resistor in series with the one between the pairs; across
-the axis conductances are in parallel. Light between two coarse cells changes from resistor to
+a network of resistors: cells may be of any form. Along the axis a coarse face is half of either
+pair's inner resistor in series with the one between the pairs; across the axis conductances are in
+parallel. Light between two coarse cells changes from resistor to
 resistor as a current's voltage does, which is how corrections are interpolated: where the medium
 jumps they jump with it (operator-dependent transfers: Alcouffe, Brandt, Dendy and Painter 1981,
 doi:10.1137/0902035).

@@ -6,16 +6,16 @@ of the solution, one solve A^T lambda = u_bar serves all of them: S_bar = lambda
 from A_bar = -lambda u^T, of which only the entries that p appears in are needed.
 
 An operator knows its transpose and these products with dA; `ImplicitSolve` does the rest, for every
-scheme. `AutodiffOperator` leaves them to torch, for any function of u.
+scheme.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,7 +105,7 @@ class ImplicitSolve(torch.autograd.Function):
     `prepared` is what solvers keep about A from one solve to the next. A has its derivative
     `linearized(u)`, which is A itself unless A depends on u. That has its `transposed()`;
     `cotangents(lambda, u)`, those of `tensors` for A_bar = -lambda u^T (E3.2); and, for their
-    changes or None, `change(d_tensors, u)`, which is dA u (E3.1).
+    changes, `change(d_tensors, u)`, which is dA u (E3.1).
     """
 
     @staticmethod
@@ -150,8 +150,10 @@ class ImplicitSolve(torch.autograd.Function):
     ) -> Tensor:
         u, *tensors = ctx.saved_tensors
         operator = ctx.assemble(ctx.prepared, *tensors).linearized(u)
+        pairs = zip(tensors, d_tensors, strict=True)
+        changes = [torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs]
         # E3.1: A du = dS - dA u.
-        right = -operator.change(d_tensors, u)
+        right = -operator.change(changes, u)
         right = right if d_source is None else right + d_source
 
         def solve(right: Tensor, u: Tensor, *tensors: Tensor) -> Tensor:
@@ -159,61 +161,6 @@ class ImplicitSolve(torch.autograd.Function):
 
         d_u: Tensor = run_plainly(solve, right, u, *tensors)
         return d_u
-
-
-@dataclass(frozen=True, kw_only=True)
-class AutodiffOperator:
-    """N(u, p) of some `tensors` p; its derivative J = dN/du at `center`; or the transpose of that.
-
-    torch takes the derivatives of N, which is `product`.
-    """
-
-    tensors: tuple[Tensor, ...]
-    center: Any = None
-    is_transposed: bool = False
-
-    def product(self, u: Tensor, *tensors: Tensor) -> Tensor:
-        """N(u, p)."""
-        raise NotImplementedError
-
-    @cached_property
-    def _pull(self) -> Callable[[Tensor], tuple[Tensor, ...]]:
-        """By lambda J^T lambda, and (dN/dp)^T lambda of each of p."""
-        return torch.func.vjp(self.product, self.center, *self.tensors)[1]
-
-    @cached_property
-    def _push(self) -> Callable[[tuple[Tensor, ...]], tuple[Tensor]]:
-        """By (du, dp) the sum of J du and dN/dp dp.
-
-        By reverse mode twice: torch refuses forward mode inside a custom function's own jvp.
-        """
-        return torch.func.vjp(self._pull, torch.zeros_like(self.center))[1]
-
-    def apply(self, u: Tensor) -> Tensor:
-        """N(u), J u or J^T u."""
-        if self.center is None:
-            return self.product(u, *self.tensors)
-        if self.is_transposed:
-            return self._pull(u)[0]
-        return self._push((u, *map(torch.zeros_like, self.tensors)))[0]
-
-    def linearized(self, u: Tensor) -> Self:
-        """J at `u`."""
-        return replace(self, center=u)
-
-    def transposed(self) -> Self:
-        """J^T."""
-        return replace(self, is_transposed=not self.is_transposed)
-
-    def cotangents(self, adjoint: Tensor, _: Tensor) -> tuple[Tensor, ...]:
-        """-(dN/dp)^T lambda of each of p (E3.2)."""
-        return self._pull(-adjoint)[1:]
-
-    def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
-        """dN/dp dp of all p together (E3.1)."""
-        pairs = zip(self.tensors, d_tensors, strict=True)
-        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs)
-        return self._push((torch.zeros_like(u), *changes))[0]
 
 
 def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor) -> Tensor:

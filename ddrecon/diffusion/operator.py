@@ -104,12 +104,9 @@ class Operator:
         )
         return (adjoint * u).sum_to_size(self.loss.shape), *conductance_bars
 
-    def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
+    def change(self, d_tensors: Iterable[Tensor], u: Tensor) -> Tensor:
         """dA u = dloss u + G^T (dc G u) of each axis (E3.1)."""
-        tensors = self.loss, *self.conductances
-        pairs = zip(tensors, d_tensors, strict=True)
-        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs)
-        return Operator.of(self.periodic, self.spacing, {}, *changes).apply(u)
+        return Operator.of(self.periodic, self.spacing, {}, *d_tensors).apply(u)
 
 
 def difference(u: Tensor, axis: int) -> Tensor:

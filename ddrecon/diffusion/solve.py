@@ -124,15 +124,6 @@ def prepare(operator: Operator) -> Hierarchy:
     return Hierarchy.of(replace(operator, prepared={}), Passes())
 
 
-def _steps_of(operator: Operator, source: Tensor) -> Any:
-    """The steps of an iteration, by the engine at hand."""
-    if not is_fused():
-        return TensorSteps(operator, source)
-    from ddrecon.diffusion.fused.passes import KernelSteps  # imports Warp
-
-    return KernelSteps(operator, source)
-
-
 def _iterate(
     operator: Operator,
     source: Tensor,
@@ -141,7 +132,10 @@ def _iterate(
     count: int | None,
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
-    steps, iteration = _steps_of(operator, source), 0
+    kind: type[Any] = TensorSteps
+    if is_fused():
+        from ddrecon.diffusion.fused.passes import KernelSteps as kind  # imports Warp
+    steps, iteration = kind(operator, source), 0
     torch.mul(source, source, out=steps.product).mul_(steps.inverse)
     torch.sum(steps.product, (1, 2, 3), keepdim=True, out=steps.square)
     at_least = steps.square.clamp(min=torch.finfo(source.dtype).tiny)

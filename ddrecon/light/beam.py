@@ -14,9 +14,8 @@ from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
-from ddrecon.medium.coefficients import Medium, along_colors, mean_width
+from ddrecon.medium.coefficients import Medium, along_colors, mean_width, remaining_moments
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.decay import Nodes
 from ddrecon.numerics.harmonics import harmonics

@@ -35,7 +35,7 @@ class AmbientLight:
 class EnvironmentLight:
     """A latitude-longitude map of light from infinitely far away.
 
-    `radiance` [C, h, w] >= 0 of every pixel, h >= 2 (`environment.py` says which lies where);
+    `radiance` [C, h, w] >= 0 of every pixel, h >= 2 (`sky.py` says which lies where);
     `scale`: scalar factor on it; `rotation`: scalar, about the pole [degrees]; `directions`: how
     many regions the light on the volume is gathered into; `up`: y or z, where the pole is.
     """

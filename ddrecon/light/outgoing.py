@@ -11,8 +11,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.light.moments import floored, radiance_along, weigh
 from ddrecon.light.pairs import ReversedBeam
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
+from ddrecon.medium.coefficients import Medium, remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.series import angle_of, look_up

@@ -18,8 +18,7 @@ from ddrecon.light.beam import average_parts, unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import add, beam_moments, weigh
 from ddrecon.light.shear import Shear, sum_masses
-from ddrecon.medium.coefficients import Medium, along_colors
-from ddrecon.medium.remaining import backward_fraction, unturned_moments
+from ddrecon.medium.coefficients import Medium, along_colors, backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.layout import unroll_along

@@ -15,15 +15,20 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import one_hot, pad
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import Inflow, OutgoingLight
-from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import (
+    Medium,
+    for_channels,
+    mean_width,
+    remaining_moments,
+    thinness,
+)
 from ddrecon.numerics.autodiff import differentiate_once, is_fused, run_plainly
 from ddrecon.numerics.remember import remember
 
@@ -39,10 +44,10 @@ OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
 FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order of what differs from face to face."""
-_Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Along an axis, for each place: of two cells, which and how much of it."""
-_Entries = Sequence[Tensor]
+_Entries = tuple[Tensor, Tensor, Tensor]
 """Rows, columns and weights of a sparse matrix."""
+_Along = tuple[Tensor, Tensor]
+"""Of each place along an axis two entries [places, 2]: which cells they are, and their weights."""
 
 
 class _Table(NamedTuple):
@@ -78,6 +83,23 @@ class _Pair(NamedTuple):
 
     table: _Table
     transposed: _Table
+
+    @staticmethod
+    def of(
+        height: int, width: int, entries: _Entries, dtype: torch.dtype, device: torch.device
+    ) -> _Pair:
+        """The matrix [height, width] that has these `entries`, and its transpose."""
+
+        def table(size: int, rows: Tensor, columns: Tensor, weights: Tensor) -> _Table:
+            rows, order = rows.sort(stable=True)
+            filled, counts = rows.unique_consecutive(return_counts=True)
+            starts = pad(counts.cumsum(0), (1, 0))
+            numbers = (t.to(device, torch.int32) for t in (rows, columns[order], filled, starts))
+            rows, columns, filled, starts = numbers
+            return _Table(size, rows, columns, weights[order].to(device, dtype), filled, starts)
+
+        rows, columns, weights = entries
+        return _Pair(table(height, rows, columns, weights), table(width, columns, rows, weights))
 
     def times(self, values: Tensor, within: Tensor | None = None) -> Tensor:
         """The product [C, height] with `values` [C, width].
@@ -280,8 +302,8 @@ def _beside(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
     number, none = torch.arange(grid.cells).view(grid.shape), torch.zeros(0, dtype=torch.long)
     layers = (number.select(axis, -side).flatten() for axis, side in _faces_of(grid))
     cells = torch.cat([none, *layers])
-    one_each = torch.arange(len(cells)), cells, torch.ones(len(cells))
-    return _pair(len(cells), grid.cells, one_each, dtype, device)
+    entries = torch.arange(len(cells)), cells, torch.ones(len(cells))
+    return _Pair.of(len(cells), grid.cells, entries, dtype, device)
 
 
 @remember
@@ -303,9 +325,9 @@ def _faces_of(grid: Grid) -> list[tuple[int, int]]:
 @remember
 def _find_dark(grid: Grid, place: Tensor, is_point: bool) -> Tensor:
     """The part of mass to a light, 0 to 1, that it has at places around the box, [1, M]."""
-    lit = pad(1 - shine_through(grid, place, is_point), (0, 1), value=1.0)
-    z, y, x = _beyond(grid, place.dtype, place.device).times(lit[None]).chunk(3, 1)
-    return z * y * x
+    dark = pad(1 - shine_through(grid, place, is_point), (0, 1), value=1.0)
+    z, y, x = _beyond(grid, dark.dtype, dark.device) @ dark
+    return (z * y * x)[None]
 
 
 def shine_through(grid: Grid, place: Tensor, is_point: bool) -> Tensor:
@@ -324,74 +346,8 @@ def shine_through(grid: Grid, place: Tensor, is_point: bool) -> Tensor:
 
 
 @remember
-def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
-    """The places around the box of `grid`; across `axis` those that are extended are on faces."""
-    wide = tuple(count + 2 for count in grid.shape)
-    nearest, places, size = _nearest_cells(grid), _places_around(wide), math.prod(wide)
-    number = torch.full((size,), -1)
-    number[places] = torch.arange(len(places))
-
-    # Along an axis, places and where each goes on from: value + share (value - value before).
-    on_line, beyond = list[_Along](), list[_Along]()
-    for along, count in enumerate(grid.shape):
-        place = torch.arange(count + 2)
-        cell, low, high = (place - 1).clamp(0, count - 1), place == 0, place == count + 1
-        share = (low | high).double() * (count > 1)
-        before = (cell + low.long() - high.long()).clamp(0, count - 1)
-        on_line.append(((cell, 1 + share / 2), (before, -share / 2)))
-        share = share * (along != axis)
-        beyond.append(((place, 1 + share), (place.clamp(1, count), -share)))
-    unit = torch.ones(len(places), dtype=torch.float64)
-    order, (rows, columns, weights) = torch.arange(len(places)), _multiply(beyond, wide, places)
-    is_inner = number[columns] < 0
-    same = order, nearest[places], unit
-    inner = rows[is_inner], nearest[columns[is_inner]], weights[is_inner]
-    rows, columns, weights = (column[~is_inner] for column in (rows, columns, weights))
-    # Light on faces, then what is made of cells.
-    around = [
-        (places[rows], number[columns], weights),
-        (places, len(places) + order, unit),
-    ]
-    lacking, width = _find_layers(grid, axis, nearest.view(wide))
-
-    def pair(height: int, columns: int, *blocks: _Entries) -> _Pair:
-        entries = (torch.cat(many) for many in zip(*blocks, strict=True))
-        return _pair(height, columns, tuple(entries), dtype, device)
-
-    count = len(places)
-    lines = [
-        (rows + number * count, *rest)
-        for number, (rows, *rest) in enumerate(
-            [same, _multiply(on_line, grid.shape, places), inner]
-        )
-    ]
-    shifted = lacking[0], 2 * count + lacking[1], lacking[2]
-    return _Shell(
-        pair(count, grid.cells, same),
-        pair(3 * count, grid.cells, *lines),
-        pair(size, grid.cells, (places, nearest[places], unit)),
-        pair(size, 2 * count, *around),
-        pair(size, 2 * count + len(width), *around, shifted),
-        width.to(device, dtype) / UNEVEN,
-    )
-
-
-def _nearest_cells(grid: Grid) -> Tensor:
-    """The number of the cell nearest to each place of an extended field."""
-    cells = torch.arange(grid.cells).view(1, *grid.shape)
-    return pad(cells.double()[None], [1] * 6, mode="replicate").long().flatten()
-
-
-def _places_around(wide: Sequence[int]) -> Tensor:
-    """The places [M] of the layer around a box, among those of an extended field."""
-    is_outside = torch.ones(*wide, dtype=torch.bool)
-    is_outside[1:-1, 1:-1, 1:-1] = False
-    return is_outside.flatten().nonzero()[:, 0]
-
-
-@remember
-def _beyond(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
-    """Beyond which of `FACES` each of M places lies, by axis, [3 M, 7]; 6 for none."""
+def _beyond(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Beyond which of `FACES` each of M places lies, by axis, one of [3, M, 7]; 6 for none."""
     faces = list[Tensor]()
     for along, count in enumerate(grid.shape):
         face = torch.full((count + 2,), len(FACES))
@@ -399,63 +355,90 @@ def _beyond(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
             face[0], face[-1] = 2 * along, 2 * along + 1
         faces.append(face)
     by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)
-    columns = by_axis[:, _places_around([count + 2 for count in grid.shape])].flatten()
-    one_each = torch.arange(len(columns)), columns, torch.ones(len(columns))
-    return _pair(len(columns), len(FACES) + 1, one_each, dtype, device)
+    return one_hot(by_axis[:, _find_places(grid)[0]], len(FACES) + 1).to(device, dtype)
 
 
-def _pair(
-    height: int, width: int, entries: _Entries, dtype: torch.dtype, device: torch.device
-) -> _Pair:
-    """The matrix [height, width] that has these `entries`, and its transpose."""
-
-    def table(size: int, rows: Tensor, columns: Tensor, weights: Tensor) -> _Table:
-        rows, order = rows.sort(stable=True)
-        filled, counts = rows.unique_consecutive(return_counts=True)
-        starts = pad(counts.cumsum(0), (1, 0))
-        integers = (t.to(device, torch.int32) for t in (rows, columns[order], filled, starts))
-        rows, columns, filled, starts = integers
-        return _Table(size, rows, columns, weights[order].to(device, dtype), filled, starts)
-
-    rows, columns, weights = entries
-    return _Pair(table(height, rows, columns, weights), table(width, columns, rows, weights))
+def _find_places(grid: Grid) -> tuple[Tensor, Tensor]:
+    """The places [M] of the layer around a box, and those of cells, among an extended field's."""
+    is_cell = pad(torch.ones(grid.shape, dtype=torch.bool), [1] * 6).flatten()
+    return (~is_cell).nonzero()[:, 0], is_cell.nonzero()[:, 0]
 
 
-def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _Entries:
-    """The product of three matrices with two entries a row, one an axis: rows that are `places`.
+@remember
+def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
+    """The places around the box of `grid`; across `axis` those that are extended are on faces."""
+    places, cells = _find_places(grid)
+    wide, count = [n + 2 for n in grid.shape], len(places)
 
-    `size`: how many columns each matrix has.
-    """
-    rows, columns, weights = list[Tensor](), list[Tensor](), list[Tensor]()
-    for (z, a), (y, b), (x, c) in product(*axes):
-        column = (z[:, None, None] * size[1] + y[:, None]) * size[2] + x
-        weight = (a[:, None, None] * b[:, None] * c).flatten()[places]
-        row = weight.nonzero()[:, 0]
-        rows.append(row)
-        columns.append(column.flatten()[places[row]])
-        weights.append(weight[row])
-    return torch.cat(rows), torch.cat(columns), torch.cat(weights)
+    def multiply(axes: Sequence[_Along], sizes: Sequence[int]) -> _Entries:
+        """The product of three matrices, one an axis, with columns for `sizes`: at the places."""
+        columns, weights = torch.zeros(count, 1).long(), torch.ones(count, 1).double()
+        numbers = torch.unravel_index(places, wide)
+        for (entries, parts), number, size in zip(axes, numbers, sizes, strict=True):
+            columns = (columns[:, :, None] * size + entries[number][:, None]).flatten(1)
+            weights = (weights[:, :, None] * parts[number][:, None]).flatten(1)
+        rows, which = weights.nonzero(as_tuple=True)
+        return rows, columns[rows, which], weights[rows, which]
+
+    def choose(chosen: Tensor) -> _Entries:
+        """The columns of what stands beyond faces that are `chosen` places."""
+        number = torch.full((math.prod(wide),), -1)
+        number[chosen] = torch.arange(len(chosen))
+        rows, columns, weights = multiply(beyond, wide)
+        is_there = number[columns] >= 0
+        return rows[is_there], number[columns[is_there]], weights[is_there]
+
+    def pair(height: int, width: int, *blocks: _Entries) -> _Pair:
+        rows, columns, weights = (torch.cat(many) for many in zip(*blocks, strict=True))
+        return _Pair.of(height, width, (rows, columns, weights), dtype, device)
+
+    nearest, on_line, beyond = list[_Along](), list[_Along](), list[_Along]()
+    for along, size in enumerate(grid.shape):
+        place = torch.arange(size + 2)
+        cell = place.clamp(1, size)
+        inward = (2 * cell - place).clamp(1, size)
+        share = ((cell != place) & (inward != cell)).double()[:, None]
+        ends = torch.cat([1 + share, -share], 1)
+        no_line = ends.new_tensor([1.0, 0.0]).expand_as(ends)
+        on_cells = torch.stack([cell, inward], 1) - 1
+        nearest.append((on_cells, no_line))
+        on_line.append((on_cells, (no_line + ends) / 2))
+        # Of light on faces: as far beyond as the cell is before.
+        beyond.append((torch.stack([place, cell], 1), no_line if along == axis else ends))
+    order, ones, all_places = torch.arange(count), torch.ones(count).double(), math.prod(wide)
+    same, by_cells, by_faces = multiply(nearest, grid.shape), choose(cells), choose(places)
+    blocks = enumerate([same, multiply(on_line, grid.shape), by_cells])
+    lines = [(k * count + rows, columns, weights) for k, (rows, columns, weights) in blocks]
+    # Light on faces, then what is made of cells.
+    around = [(places[by_faces[0]], *by_faces[1:]), (places, count + order, ones)]
+    (rows, columns, weights), width = _find_layers(grid, axis)
+    lacking = rows, 2 * count + columns, weights
+    return _Shell(
+        pair(count, grid.cells, same),
+        pair(3 * count, grid.cells, *lines),
+        pair(all_places, grid.cells, (places, same[1], ones)),
+        pair(all_places, 2 * count, *around),
+        pair(all_places, 2 * count + len(width), *around, lacking),
+        width.to(device, dtype) / UNEVEN,
+    )
 
 
-def _find_layers(grid: Grid, axis: int | None, nearest: Tensor) -> tuple[_Entries, Tensor]:
-    """What of `lacking` light lacks, with columns of its own; and the width of those cells [u].
-
-    `nearest` [z + 2, y + 2, x + 2]: the cell nearest to each place.
-    """
-    place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
-    number = torch.zeros(grid.cells, dtype=torch.long)
-    none = torch.zeros(0, dtype=torch.long)
+def _find_layers(grid: Grid, axis: int | None) -> tuple[_Entries, Tensor]:
+    """What of `lacking` light lacks, with columns of its own; and the width of those cells [u]."""
+    place = torch.arange(math.prod(n + 2 for n in grid.shape)).view([n + 2 for n in grid.shape])
+    none, count = torch.zeros(0, dtype=torch.long), 0
     layers = [(none, none, none.double(), none.double())]
     for along, side in _faces_of(grid):
         outer, last = (place.select(along, -1 - k if side else k) for k in range(2))
-        last = last[1:-1, 1:-1].flatten()
-        rows, cells = torch.cat([outer.flatten(), last]), nearest.flatten()[last]
-        number[cells] = count + torch.arange(len(cells))
-        count += len(cells)
+        number = count + torch.arange(last[1:-1, 1:-1].numel()).double()
+        sides = [n - 2 for n in outer.shape]
+        nearest = pad(number.view(1, *sides), [1] * 4, mode="replicate")[0].long()
+        count += len(number)
+        rows = torch.cat([outer.flatten(), last[1:-1, 1:-1].flatten()])
+        columns = torch.cat([nearest.flatten(), number.long()])
         # What stands for a face is less by what that lacks, and by what the last cell has more.
         less = -1.0 if along == axis else -2.0 - RAISED
-        weights = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
-        width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
-        layers.append((rows, number[nearest.flatten()[rows]], weights, width))
+        weights = torch.cat([number.new_full([outer.numel()], less), 0 * number + RAISED])
+        layers.append((rows, columns, weights, 0 * number + grid.spacing[along]))
     rows, columns, weights, width = (torch.cat(many) for many in zip(*layers, strict=True))
     return (rows, columns, weights), width

@@ -6,6 +6,7 @@ transmittance has a closed form. `integrate_segments` is that; all else says whe
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,12 +15,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.march.box import Crossing
-from ddrecon.march.lattice import find_rough, interpolate
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.periods import march_periods
-from ddrecon.march.samplers import Sampler
-from ddrecon.march.sight import Sight
+from ddrecon.march.samplers import Crossing, Sampler
+from ddrecon.march.sight import Sight, find_rough, interpolate
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.decay import Nodes, decayed_sum
 from ddrecon.settings import RenderSettings
@@ -57,9 +56,15 @@ def _march_alone(
         return nothing if behind is None else nothing + behind
     sampler = Sampler(outgoing, sight.sampling, settings.steps)
 
+    march_once = march_rays
+    if is_fused():
+        from ddrecon.march.fused.integrate import march_rays as march_once
+    if outgoing.period is not None:
+        march_once = functools.partial(march_periods, march_once)
+
     def march_along(rays: Rays, crossing: Crossing) -> Tensor:
         """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""
-        radiance, mass = _march_by_engine(sampler, rays, crossing)
+        radiance, mass = march_once(sampler, rays, crossing)
         if behind is None:
             return radiance
         return torch.cat([radiance, -torch.expm1(-outgoing.extinction_scale * mass)])
@@ -79,16 +84,6 @@ def _march_alone(
         return values
     scattered, opacity = values.split(outgoing.colors)
     return scattered + (1 - opacity) * behind
-
-
-def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
-    """As `march_rays`, by the engine in use, through all periods of a grid."""
-    march_once = march_rays
-    if is_fused():
-        from ddrecon.march.fused.integrate import march_rays as march_once
-    if sampler.outgoing.period is not None:
-        return march_periods(march_once, sampler, rays, crossing)
-    return march_once(sampler, rays, crossing)
 
 
 def march_rays(

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.march.box import Crossing
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.march.samplers import Sampler, next_node
+from ddrecon.march.samplers import Crossing, Sampler, next_node
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.layout import unroll
 

@@ -11,14 +11,15 @@ from ddrecon.cameras import Camera, Pane, Rays, cast_rays, subpixel_offsets
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import fill
-from ddrecon.march.box import cross_box
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.march.sight import Sight, look_along, remember_of_camera
+from ddrecon.march.samplers import cross_box
+from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.optics import reflectance, refract
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import sample_volume
+from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
 
@@ -40,7 +41,7 @@ class Window:
     reflected: Tensor
 
 
-@remember_of_camera
+@remember
 def look_inside(
     camera: Camera, grid: Grid, index: float, settings: RenderSettings
 ) -> tuple[Rays, tuple[Window, ...]]:

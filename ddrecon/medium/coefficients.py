@@ -9,22 +9,35 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
-from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, remember_of_phase
-from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.grid import Cells, Grid
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, henyey_greenstein
+from ddrecon.medium.phase_peak import (
+    SeenPhase,
+    is_scaled,
+    number_place,
+    number_table,
+    peak_moments,
+    tabulate_series,
+)
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
-from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.numerics.interpolation import resize
+from ddrecon.numerics.layout import Unrolled
+from ddrecon.numerics.remember import constant, is_any_nonzero, remember
+from ddrecon.numerics.series import legendre, look_up, series_weights, sum_series
 from ddrecon.records import bounded
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
+NEARLY_NONE = 1e-6
+"""So often each medium scatters besides across the box, for a weight where both are empty."""
 
 
 @dataclass(eq=False, repr=False)
@@ -277,7 +290,7 @@ def _find_coefficients(
     def coefficient(sigma: Tensor) -> Coefficient:
         if sigma.shape[1:].numel() == 1:
             return Coefficient(sigma, field)
-        return Coefficient(_ones(len(sigma), sigma.dtype, sigma.device), sigma * field)
+        return Coefficient(along_colors(constant([1.0] * len(sigma), sigma)), sigma * field)
 
     is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
     scale = _remember_scaled if is_small else _scale_sections
@@ -289,13 +302,6 @@ def _find_coefficients(
     else:
         remaining = coefficient(unpeaked)
     return coefficient(sigma_t), scattering, remaining, coefficient(sigma_a), peak
-
-
-@functools.cache
-def _ones(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A scale [C, 1, 1, 1] of 1, one tensor for all: what is known of it need not be read again."""
-    with torch.inference_mode(False):
-        return torch.ones(count, 1, 1, 1, dtype=dtype, device=device)
 
 
 def _scale_sections(
@@ -321,12 +327,12 @@ def _scale_sections(
 _remember_scaled = remember(_scale_sections)
 
 
-@remember_of_phase
+@remember
 def _mean_cosine(phase: PhaseFunction) -> Tensor:
     return _by_color(phase.moments(2)[:, 1])
 
 
-@remember_of_phase
+@remember
 def peak_fraction(phase: PhaseFunction, degree: int, sign: int) -> Tensor:
     """The part of scattering that a peak is, f or b by the `sign`, as of `Medium`."""
     return _by_color(phase.peak_tail(degree, 1, sign)[:, 0])
@@ -375,10 +381,6 @@ def mean_width(grid: Grid) -> float:
     return float((sum(width**-2 for width in grid.spacing) / 3) ** -0.5)
 
 
-NEARLY_NONE = 1e-6
-"""So often each medium scatters besides across the box, for a weight where both are empty."""
-
-
 def mix_media(media: Mapping[str, Volume]) -> Volume:
     """The volume of two `media` on the same grid, of density 1 (E8.10).
 
@@ -412,3 +414,127 @@ def remix(volume: Volume, media: Mapping[str, Volume]) -> Volume:
     mixed = mix_media(media)
     sigma_a, sigma_s = mixed.sigma_a, mixed.sigma_s
     return replace(volume, sigma_a=sigma_a, sigma_s=sigma_s, phase=mixed.phase, media=media)
+
+
+def volume_at_level(volume: Volume, grid: Grid, cells: Cells | None = None) -> Volume:
+    """`volume` on a coarser `grid`, each medium by itself; that may span some `cells` alone."""
+
+    def put(field: Tensor) -> Tensor:
+        return resample(field if cells is None else field[..., cells[0], cells[1], cells[2]], grid)
+
+    support, volume = volume.support, copy(volume)
+    if support is not None:
+        volume.support = None
+        if volume.emission is not None:
+            volume.emission = for_cells(volume.emission) * support
+        if volume.media is None:
+            volume.density = volume.density * support
+        else:
+            volume.media = {
+                name: replace(medium, density=medium.density * support)
+                for name, medium in volume.media.items()
+            }
+    coarse = put_volume(volume, grid, put)
+    if volume.media is None:
+        return coarse
+    media = volume.media.items()
+    return remix(coarse, {name: volume_at_level(medium, grid, cells) for name, medium in media})
+
+
+def refine_medium(medium: Medium, times: int, along: str = "xyz") -> Medium:
+    """`medium` in cells an odd number of `times` as narrow `along` axes.
+
+    It is the same between all its centers, which are centers there as well.
+    """
+    finer = medium.grid.refine(times, along)
+    return medium.put(finer, functools.partial(resample, grid=finer)) if times > 1 else medium
+
+
+def resample(field: Tensor, grid: Grid) -> Tensor:
+    """`field` [..., z, y, x] on `grid`, which spans the same box.
+
+    It is averaged where `grid` is coarser, trilinearly interpolated where it is finer, and around
+    along periodic axes. Of what is true or false, cells are true that have any of it.
+    """
+    shape = field.shape[-3:]
+    if tuple(shape) == grid.shape:
+        return field
+    if field.dtype == torch.bool:
+        return resample(field.float(), grid) > 0
+    if shape.numel() > grid.cells:
+        return resize(field, grid.shape, "area")
+    # Around periodic axes the fewest cells more on both sides that are whole cells of both.
+    before, after = [0, 0, 0], [0, 0, 0]
+    for axis in grid.periodic:
+        common = math.gcd(shape[axis], grid.shape[axis])
+        before[axis], after[axis] = shape[axis] // common, grid.shape[axis] // common
+    wide, around = (Unrolled(grid, tuple(ends), tuple(ends)) for ends in (before, after))
+    return around.crop(resize(wide.extend(field), around.wide.shape, "linear"))
+
+
+def remaining_moments(medium: Medium) -> Tensor:
+    """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E8.4), [L + 1, C or 1, 1, 1, 1].
+
+    chi_l are the moments of the phase function of `medium`, f the part of its forward peak. Of one
+    that differs from cell to cell they are [L + 1, C or 1, z, y, x].
+    """
+    return _remaining(medium.seen.phase, medium.forward_fraction, medium.seen.degree)
+
+
+@remember
+def _remaining(phase: PhaseFunction, fraction: Tensor, degree: int) -> Tensor:
+    moments = phase.moments(degree + 1).transpose(0, 1)
+    moments = moments if moments.ndim == 5 else moments[..., None, None, None]
+    return (moments - fraction) / (1 - fraction)
+
+
+def unturned_moments(medium: Medium) -> Tensor:
+    """p_l - (-1)^l b / (1 - f), of what beams scatter that keep their backward peak b (E8.11).
+
+    As `remaining_moments`.
+    """
+    turned = backward_fraction(medium) / (1 - medium.forward_fraction)
+    moments = remaining_moments(medium)
+    sign = 1 - 2 * (torch.arange(len(moments), device=turned.device) % 2).to(turned)
+    return moments - sign.view(-1, 1, 1, 1, 1) * turned
+
+
+def backward_fraction(medium: Medium) -> Tensor:
+    """b, the part of scattering that counts as turned back (E8.11), shaped as f of `Medium`."""
+    return peak_fraction(medium.seen.phase, medium.seen.degree, -1)
+
+
+def has_backward_peak(medium: Medium) -> bool:
+    """Whether a part of scattering counts as turned back: not by diffusion alone."""
+    return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
+
+
+@remember
+def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
+    """How light that a backward peak has turned scatters once more, towards a camera (E8.12).
+
+    A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
+    moments are chi_l up to `degree`, and chi_l r_l^turns beyond, where r_l are the backward peak's;
+    less the forward peak's, which counts as not scattered.
+    """
+    forward, _ = peak_moments(phase, degree)
+    _, spread = peak_moments(phase, degree, -1)
+    moments = phase.moments(phase.length()).double() - forward
+    return tabulate_series(series_weights(moments * spread**turns)[..., None])
+
+
+def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
+    """How light turned so often scatters by `angle` [z, y, x] in cells, [C, z, y, x] (E8.12)."""
+    phase, degree = medium.seen.phase, medium.seen.degree
+    number = phase.cells
+    assert number is not None
+    cosine = angle.cos().to(number)
+    table = number_table(phase, turned_table, True, -1, degree, turns).to(number)
+    coefficients = look_up(table, angle.double()).unbind(-1)
+    if not is_scaled(phase):
+        return sum_series(coefficients, number_place(phase, number))
+    turned = sum_series(coefficients, number_place(phase, -number))
+    # Where g is positive nothing is turned back, and the forward peak counts as not scattered.
+    moments = (phase.moments(degree + 1) - phase.peak_tail(degree, 1)).movedim(1, -1)
+    forward = (series_weights(moments) * legendre(cosine, degree + 1)).sum(-1)
+    return torch.where(number < 0, henyey_greenstein(cosine, number) * turned, forward)

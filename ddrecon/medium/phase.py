@@ -3,7 +3,7 @@
 They are normalized to 4 pi over the sphere, as in docs/theory.md E2.2. A phase function is known by
 its Legendre moments chi_l (E8.1), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
 chi_1 is the mean cosine g. Its numbers may differ by color; what is computed from them has the
-color as first axis, of size 1 where all colors share one phase function. Its last number may
+color as first axis, of size 1 where all colors share one phase function. One of its numbers may
 differ from cell to cell, [z, y, x] or [C, z, y, x]: then moments are followed by the cells' axes.
 """
 
@@ -13,12 +13,11 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.remember import remember
 from ddrecon.numerics.series import (
     COUNTS,
     angle_of,
@@ -31,15 +30,13 @@ from ddrecon.numerics.series import (
 NEGLIGIBLE = 1e-9
 """Moments below this are left out of series."""
 
-PhaseKind = Callable[..., "PhaseFunction"]
-"""What makes phase functions of their numbers: mostly their class."""
-
 
 @dataclass(frozen=True, eq=False)
 class PhaseFunction(ABC):
     """What every phase function can be asked.
 
-    Its fields are tensors: its numbers, by which all that it returns is differentiable.
+    Its fields are tensors, by which all that it returns is differentiable: its numbers. Or they are
+    phase functions, which have some. It is a record to `remember`.
     """
 
     NAME: ClassVar[str]
@@ -75,15 +72,14 @@ class PhaseFunction(ABC):
     def length(self) -> int:
         """How many moments are not negligible; one of `numerics.series.COUNTS`."""
 
-    @property
-    def numbers(self) -> tuple[Tensor, ...]:
-        """All numbers, as `kind` takes them; last is what may differ from cell to cell."""
-        return tuple(getattr(self, field.name) for field in fields(self))
-
-    @property
-    def kind(self) -> PhaseKind:
-        """What makes such a phase function of its `numbers`; it can be hashed."""
-        return type(self)
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same with what `function` makes of each of its numbers."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        mapped = {
+            name: value.map(function) if isinstance(value, PhaseFunction) else function(value)
+            for name, value in values.items()
+        }
+        return replace(self, **mapped)
 
     @property
     def variables(self) -> dict[str, Tensor]:
@@ -162,20 +158,6 @@ class Rayleigh(PhaseFunction):
 
     def length(self) -> int:
         return COUNTS[0]
-
-
-def remember_of_phase(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """`function` of a phase function, kept as long as the numbers of that stay (`remember`)."""
-
-    @remember
-    def find(kind: PhaseKind, count: int, *arguments: Any) -> Tensor:
-        return function(kind(*arguments[:count]), *arguments[count:])
-
-    @functools.wraps(function)
-    def recall(phase: PhaseFunction, *others: Any) -> Tensor:
-        return find(phase.kind, len(phase.numbers), *phase.numbers, *others)
-
-    return recall
 
 
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
@@ -277,25 +259,6 @@ class Blend(Mixture):
     @property
     def parts(self) -> tuple[PhaseFunction, PhaseFunction]:
         return self.first, self.second
-
-    @property
-    def numbers(self) -> tuple[Tensor, ...]:
-        return *self.first.numbers, *self.second.numbers, self.weight
-
-    @property
-    def kind(self) -> PhaseKind:
-        return _find_kind(type(self.first), type(self.second))
-
-
-@functools.cache
-def _find_kind(first: type[PhaseFunction], second: type[PhaseFunction]) -> PhaseKind:
-    """What makes blends of the numbers of two kinds of phase functions and a weight."""
-    count = len(fields(first))
-
-    def blend(*numbers: Tensor) -> Blend:
-        return Blend(first(*numbers[:count]), second(*numbers[count:-1]), numbers[-1])
-
-    return blend
 
 
 NODES = 2048

@@ -19,14 +19,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import (
-    HenyeyGreenstein,
-    PhaseFunction,
-    PhaseKind,
-    henyey_greenstein,
-    remember_of_phase,
-)
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, henyey_greenstein
 from ddrecon.numerics.decay import decay_mean
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.series import (
     COEFFICIENTS,
     STEPS,
@@ -83,10 +78,9 @@ class SeenPhase:
         seen = [row[0] if depth is None else evaluate(row, depth_place(depth)) for row in rows]
         if self.number is None:
             return seen[0].clamp(min=0) if has_peak else seen[0]
-        kind = self.phase.kind
-        value = sum_series(seen, number_place(kind, self.number))
+        value = sum_series(seen, number_place(self.phase, self.number))
         value = value.clamp(min=0) if has_peak else value
-        return henyey_greenstein(cosine, self.number) * value if is_scaled(kind) else value
+        return henyey_greenstein(cosine, self.number) * value if is_scaled(self.phase) else value
 
     def table(self, has_peak: bool) -> Tensor:
         """Of S its coefficients, [C, steps + 1, 2, K], or without a peak of p the values.
@@ -100,23 +94,23 @@ class SeenPhase:
         return number_table(self.phase, make, has_peak, 1, *degree)
 
 
-def is_scaled(kind: PhaseKind) -> bool:
+def is_scaled(phase: PhaseFunction) -> bool:
     """Whether the number is g, and tables have S over p; else p is linear in it, a weight."""
-    return kind is HenyeyGreenstein
+    return isinstance(phase, HenyeyGreenstein)
 
 
 def count_powers(phase: PhaseFunction, has_peak: bool) -> int:
     """Coefficients of S over the number that differs from cell to cell, 1 where none does."""
     if phase.cells is None:
         return 1
-    if is_scaled(phase.kind):
+    if is_scaled(phase):
         return COEFFICIENTS if has_peak else 1
     return WEIGHT_POWERS if has_peak else 2
 
 
-def number_place(kind: PhaseKind, number: Tensor) -> Tensor:
+def number_place(phase: PhaseFunction, number: Tensor) -> Tensor:
     """`number` from -1 to 1 in polynomials: of a weight, or of g by its artanh, 0 and less as 0."""
-    if not is_scaled(kind):
+    if not is_scaled(phase):
         return 2 * number - 1
     g = torch.where(number > 0, number, torch.zeros_like(number))
     g = torch.where(g < STEEPEST, g, torch.full_like(g, STEEPEST))
@@ -131,9 +125,11 @@ def number_table(
     They are [C, steps + 1, 2, powers K], of tables [C, steps + 1, 2, K], with so many powers as
     `count_powers` says. `sign` is that of g.
     """
-    powers, device = count_powers(phase, has_peak), phase.numbers[0].device
-    numbers = _fitted_numbers(is_scaled(phase.kind), powers, sign, device)
-    return _fit(phase.with_cells(numbers), make, *arguments)
+    assert phase.cells is not None
+    numbers = _fitted_numbers(
+        is_scaled(phase), count_powers(phase, has_peak), sign, phase.cells.device
+    )
+    return _fit(phase.with_cells(numbers), numbers, make, *arguments)
 
 
 @functools.cache
@@ -145,13 +141,15 @@ def _fitted_numbers(is_g: bool, powers: int, sign: int, device: torch.device) ->
     return (sign * torch.tanh(math.atanh(STEEPEST) * half) if is_g else half).to(device)
 
 
-@remember_of_phase
-def _fit(phase: PhaseFunction, make: Callable[..., Tensor], *arguments: int) -> Tensor:
-    """As `number_table`, of a `phase` with all numbers at which polynomials are fitted."""
+@remember
+def _fit(
+    phase: PhaseFunction, numbers: Tensor, make: Callable[..., Tensor], *arguments: int
+) -> Tensor:
+    """As `number_table`, of a `phase` with all `numbers` at which polynomials are fitted."""
     # one after the other: weak peaks have short series
-    phases = [phase.with_cells(number) for number in phase.numbers[-1]]
+    phases = [phase.with_cells(number) for number in numbers]
     tables = torch.stack([make(at_number, *arguments) for at_number in phases])
-    if is_scaled(phase.kind):
+    if is_scaled(phase):
         # S over p, where p is summed as S is
         moments = (at_number.moments(at_number.length()).double() for at_number in phases)
         sums = torch.stack([tabulate_series(series_weights(chi)[..., None]) for chi in moments])
@@ -196,20 +194,16 @@ def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
     return series_weights(chi - peak + peak * turned)
 
 
-def _in_double(phase: PhaseFunction) -> PhaseFunction:
-    return phase.kind(*(number.double() for number in phase.numbers))
-
-
-@remember_of_phase
+@remember
 def _plain_table(phase: PhaseFunction) -> Tensor:
-    cosines = even_angles(STEPS).to(phase.numbers[0].device).cos()
-    return with_slopes(_in_double(phase).value(cosines))
+    cosines = even_angles(STEPS).to(phase.moments(1).device).cos()
+    return with_slopes(phase.map(Tensor.double).value(cosines))
 
 
-@remember_of_phase
+@remember
 def _peak_table(phase: PhaseFunction, degree: int) -> Tensor:
     """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of a phase function."""
-    places, inverse, _ = (array.to(phase.numbers[0].device) for array in extrema(COEFFICIENTS))
+    places, inverse, _ = (array.to(phase.moments(1).device) for array in extrema(COEFFICIENTS))
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].
-    series = peaked_series(_in_double(phase), degree, depth_at(places)[None, :, None])
+    series = peaked_series(phase.map(Tensor.double), degree, depth_at(places)[None, :, None])
     return tabulate_series((inverse @ series).mT)

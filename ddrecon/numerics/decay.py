@@ -1,8 +1,6 @@
 """Integrals along rays, of what is linear between nodes and of exponential decay there.
 
-Decay is integrated in closed form over steps on which the optical depth is linear.
-
-Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
+Over depths from a to b >= a, linear in between, the mean of exp(-depth) is exp(-a) phi(b - a), with
 
     phi(d) = (1 - exp(-d)) / d,    psi(d) = phi + phi' = (1 - phi) / d.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 from weakref import WeakValueDictionary, ref
 
@@ -73,16 +74,17 @@ class _Result(NamedTuple):
 def remember(function: Callable[P, T]) -> Callable[P, T]:
     """`function`, which is not called again while its arguments are the same and unchanged.
 
-    They are tensors and what can be hashed, by position. Nothing is remembered where a tensor is
-    varied. The result must share no memory with arguments, and nobody may change it.
+    They are tensors, records of tensors, and what can be hashed, by position. Nothing is remembered
+    where a tensor is varied. The result must share no memory with arguments, and nobody may change
+    it.
     """
     memory = _memory  # tensors go later than a module's names do
 
     def recall(*arguments: Any) -> Any:
-        tensors = [value for value in arguments if isinstance(value, Tensor)]
+        tensors = list[Tensor]()
+        key = function, *[_identify(argument, tensors) for argument in arguments]
         if not is_steady(*tensors):
             return function(*arguments)  # type: ignore[call-arg]
-        key = function, *((id(a),) if isinstance(a, Tensor) else a for a in arguments)
         result = memory.get(key)
         if result is not None and all(map(_Source.is_still, result.sources, tensors)):
             return result.value
@@ -103,6 +105,26 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
         return value
 
     return cast("Callable[P, T]", functools.wraps(function)(recall))
+
+
+def _identify(argument: Any, tensors: list[Tensor]) -> Any:
+    """What of an `argument` can be hashed, with its `tensors` in their order."""
+    if isinstance(argument, Tensor):
+        tensors.append(argument)
+        return (id(argument),)
+    kind: Any = type(argument)
+    names = _fields_of(kind)
+    if names is None:
+        return argument
+    return kind, *[_identify(getattr(argument, name), tensors) for name in names]
+
+
+@functools.cache
+def _fields_of(kind: type) -> list[str] | None:
+    """The names of the fields of records that cannot be hashed by these."""
+    if is_dataclass(kind) and kind.__eq__ is object.__eq__:
+        return [field.name for field in fields(kind)]
+    return None
 
 
 def forget_changed() -> None:

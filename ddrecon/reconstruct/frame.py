@@ -13,15 +13,11 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
-from ddrecon.reconstruct.metric import find_diagonals
-from ddrecon.reconstruct.numbers import Point
+from ddrecon.reconstruct.gradients import Differentiated, Replays, solve_tolerances
+from ddrecon.reconstruct.metric import Point, find_diagonals
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
-from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.recording import Replays
-from ddrecon.reconstruct.search import Objective
 from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
@@ -30,7 +26,9 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Row:
-    """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
+    """One iteration, and the volume that it leaves: the last that the search accepted.
+
+    PSNRs [dB] and SSIMs are means over views, of values as they are compared.
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
@@ -50,24 +48,14 @@ class Row:
     ssim: float | None = None
     test_ssim: float | None = None
 
-    def after(self, total: Row, is_accepted: bool) -> Row:
-        """The running totals of the log with this row: sums, and quality as last known.
-
-        Of a candidate that was refused, its quality does not count.
-        """
-        stale = () if is_accepted else OF_CANDIDATE
-        known = {
-            name: getattr(total, name)
-            for name, value in vars(self).items()
-            if value is None or name in stale
-        }
+    def after(self, total: Row) -> Row:
+        """The running totals of the log with this row: sums, and quality as last known."""
+        known = {name: getattr(total, name) for name, x in vars(self).items() if x is None}
         counts = "forward_iterations", "adjoint_iterations"
         sums = {name: getattr(total, name) + getattr(self, name) for name in counts}
         return replace(self, **known, **sums)
 
 
-OF_CANDIDATE = ("loss", "data_loss", "penalty", "psnr", "ssim")
-"""What a row says of a candidate, which may be refused."""
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
 
@@ -82,12 +70,16 @@ class Result:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A frame's `objective`, by names of parameters, and the images that were `compared` for it.
+    """What a frame adds to the objective, and the images that were `compared` for it.
 
-    The objective is relative to the mean square of the targets; `psnr` [dB] is the images' mean.
+    These are the `loss` of images and the `prior`, with their derivatives by name, relative to the
+    mean square of the targets; `psnr` [dB] is the images' mean.
     """
 
-    objective: Objective
+    loss: float
+    prior: float
+    gradients: Mapping[str, Tensor]
+    prior_gradients: Mapping[str, Tensor]
     psnr: float
     compared: Comparison
 
@@ -137,7 +129,7 @@ class Frame:
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
         bars = {name: bar for name, (_, bar) in priors.items()}
-        return Evaluation(Objective(of_images / unit, prior, relative, bars), psnr, compared)
+        return Evaluation(of_images / unit, prior, relative, bars, psnr, compared)
 
     def noise_loss(self) -> float:
         """The loss of perfect images: that of the pictures' noise and of the model's own error."""
@@ -155,16 +147,15 @@ class Frame:
             total += view.weight / weights * float(loss)
         return total / self.problem.unit
 
-    def find_diagonals(
-        self, parameters: Sequence[Parameter], compared: Comparison
-    ) -> dict[str, Tensor]:
-        """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
-        point, memory = self.point(compared), self.memory
+    def find_diagonals(self, names: Sequence[str], compared: Comparison) -> dict[str, Tensor]:
+        """The diagonal of the objective's Gauss-Newton matrix, by the parameters called `names`."""
+        memory = self.memory
         # Random pictures need no exact light, and their adjoint is near to no other.
         inexact = SolveMemory(
             memory.is_warm, dict(memory.last), memory.records, solve_tolerances(1.0)
         )
-        return find_diagonals(point.scene, parameters, point.values, point.weights, inexact)
+        parameters = [p for p in self.parameters if p.name in names]
+        return find_diagonals(self.point(compared), parameters, inexact)
 
     def point(self, compared: Comparison) -> Point:
         """Where the parameters stand, with how strongly the pixels `compared` count."""
@@ -187,13 +178,14 @@ class Frame:
     ) -> Row:
         """The log's row of an iteration, which took `seconds`; the prior counts by `weight`.
 
-        The running totals keep the losses of the last candidate that the search accepted.
+        Of a candidate that was refused it has what the volume before it came to.
         """
-        objective, unit, counts = evaluation.objective, self.problem.unit, Counter[str]()
+        loss, prior = evaluation.loss, weight * evaluation.prior
+        unit, counts = self.problem.unit, Counter[str]()
         for record in self.memory.records:
             counts[record.kind] += record.iterations
         quality = dict[str, float]()
-        if is_test_due:
+        if is_test_due and is_accepted:
             quality["ssim"] = evaluation.compared.similarity()
         if is_test_due and self.level.test.views:
             quality["test_psnr"], quality["test_ssim"] = render_quality(
@@ -202,16 +194,19 @@ class Frame:
         row = Row(
             iteration=self.total.iteration + 1,
             seconds=self.total.seconds + seconds,
-            loss=objective.total(weight) * unit,
-            data_loss=objective.loss * unit,
-            penalty=objective.prior * weight * unit,
+            loss=(loss + prior) * unit,
+            data_loss=loss * unit,
+            penalty=prior * unit,
             psnr=evaluation.psnr,
             forward_iterations=counts["forward"],
             adjoint_iterations=counts["adjoint"],
             cells=self.level.train.volume.grid.cells,
             **({"test_psnr": None} | quality),
         )
-        self.total = row.after(self.total, is_accepted)
+        if not is_accepted:
+            kept = "loss", "data_loss", "penalty", "psnr"
+            row = replace(row, **{name: getattr(self.total, name) for name in kept})
+        self.total = row.after(self.total)
         return row
 
     def current_scene(self) -> Scene:
@@ -232,16 +227,13 @@ class Frame:
             "misfit": self.misfit,
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up the parameters and the log of `state`."""
+    def restore(self, state: Mapping[str, Any], level: int) -> None:
+        """Takes up the `state` of a frame that was at a `level` of resolution."""
         for p in self.parameters:
             p.restore(state["parameters"][p.name])
+        self.enter(level)
         self.total, self.misfit = Row(**state["total"]), state["misfit"]
-
-    def restore_solutions(self, state: Mapping[str, Any]) -> None:
-        """Takes up what solves begin from, at the resolution of `state`."""
-        like = self.problem.scene.volume.density
-        self.memory.last |= {kind: u.to(like) for kind, u in state["solutions"].items()}
+        self.memory.last = dict(state["solutions"])
         # By which iterations are recorded on a GPU.
         self.memory.iterations = dict(state["iterations"])
 

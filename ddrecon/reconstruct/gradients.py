@@ -3,27 +3,46 @@
 The light inside the volume is solved once and held as if it were given; each view's derivative goes
 back to it at once and is added up there, and the sum goes back through the solve. So memory does
 not grow with the number of views, and the adjoint (E3.2) is solved once.
+
+On a GPU these acts are recorded once a resolution and then replayed: a program of the light, one of
+each view, and one of the way back through the light. They are fixed programs of the parameters'
+values and of the last solutions, which are copied to where the programs look for them. A solve
+makes one iteration more than it took last; whether that was enough is read after the replay.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
+from ddrecon.numerics.remember import without_reads
 from ddrecon.picture import view_picture
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers, sum_over_ranks
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
+
+if TYPE_CHECKING:
+    from ddrecon.reconstruct.objective import Comparison
+
+LOG = logging.getLogger(engine.LOG)
+SPARE = 1
+"""Iterations of a solve beyond those it took last: tolerances fall as images come closer."""
+Recorded = tuple[Any, Callable[[], object]]
+"""The result of a computation, and a function that computes it again, in place."""
+Record = Callable[[Callable[[], Any]], Recorded]
 
 
 @dataclass(frozen=True)
@@ -62,18 +81,14 @@ def differentiate(
     same on all of them.
     """
     cut = follow_light(scene, values, memory)
-    outside = {name: value for name, value in values.items() if not is_of_volume(name)}
     inputs = [*values.values(), *cut.leaves]
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), cut.light_field.diffuse.new_zeros(())
-    added = set[int]()
     for name in own_views(scene, names):
-        # Views share what is made of values: so that each has a graph of its own, it is made anew.
-        world = with_values(scene, outside)
-        image, view_loss, bars = differentiate_view(cut.light_field, world, name, loss_of, inputs)
+        image, view_loss, bars = differentiate_view(cut, scene, values, name, loss_of)
         images.append(image)
         loss = loss + view_loss
-        _accumulate(sums, bars, added)
+        sums = list(map(_add, sums, bars))
         del bars
     total, *sums = sum_present([loss, *sums], [loss, *inputs])
     direct, leaf_bars, tensors = sums[: len(values)], sums[len(values) :], cut.tensors
@@ -81,12 +96,19 @@ def differentiate(
     del cut, inputs, sums
     through_light = follow_back(tensors, leaf_bars, list(values.values()))
     # The derivative is the sum of both ways.
-    _accumulate(direct, through_light, set())
+    totals = map(_add, direct, through_light)
     gradients = {
-        name: torch.zeros_like(values[name]) if bar is None else bar
-        for name, bar in zip(values, direct, strict=True)
+        name: torch.zeros_like(value) if bar is None else bar
+        for (name, value), bar in zip(values.items(), totals, strict=True)
     }
     return Differentiated(images, loss if total is None else total, agree_on(gradients))
+
+
+def _add(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Their sum; None is zero."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first + second
 
 
 def follow_light(scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory) -> Cut:
@@ -97,19 +119,21 @@ def follow_light(scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory
 
 
 def differentiate_view(
-    light_field: LightField,
+    cut: Cut,
     scene: Scene,
+    values: Mapping[str, Tensor],
     name: str,
     loss_of: Callable[[View, Tensor], Tensor],
-    inputs: Sequence[Tensor],
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
-    """The image and the loss of the view called `name`, and the derivatives by `inputs`.
+    """The image and the loss of the view called `name`, and the derivatives.
 
-    None is zero.
+    They are those by `values` and by the leaves of the light; None is zero.
     """
-    view = scene.view(name)
+    # Views share what is made of values: so that each has a graph of its own, it is made anew.
+    world = with_values(scene, {n: value for n, value in values.items() if not is_of_volume(n)})
+    view, inputs = world.view(name), [*values.values(), *cut.leaves]
     derivatives = scene.optimize.derivatives if scene.optimize else "all"
-    image = view_picture(light_field, scene, view, derivatives)
+    image = view_picture(cut.light_field, world, view, derivatives)
     loss = loss_of(view, image)
     bars: Sequence[Tensor | None] = [None] * len(inputs)
     if loss.requires_grad:
@@ -156,41 +180,23 @@ class _Reached(torch.autograd.Function):
         return None, *bars
 
 
-def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]) -> None:
-    """Adds `bars` to `sums`, entry by entry; None is zero.
-
-    In place where a sum is one of ours, as those numbered `added` are: autograd may hand out one
-    tensor for two inputs.
-    """
-    for i, bar in enumerate(bars):
-        known = sums[i]
-        if known is None or bar is None:
-            sums[i] = bar if known is None else known
-        elif i in added:
-            known += bar
-        else:
-            sums[i] = known + bar
-            added.add(i)
-
-
 def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
     """`record` with leaves in place of tensors that have a graph; both are added to the lists.
 
     A tensor that occurs twice becomes one leaf.
     """
-    if isinstance(record, Tensor):
-        if not record.requires_grad:
-            return record
-        existing = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
-        if not existing:
-            tensors.append(record)
-            leaves.append(record.detach().requires_grad_())
-        return existing[0] if existing else leaves[-1]
+    if isinstance(record, Tensor) and record.requires_grad:
+        for tensor, leaf in zip(tensors, leaves, strict=True):
+            if tensor is record:
+                return leaf
+        tensors.append(record)
+        leaves.append(record.detach().requires_grad_())
+        return leaves[-1]
     if isinstance(record, tuple):
         return tuple(_cut(entry, tensors, leaves) for entry in record)
     if is_dataclass(record) and not isinstance(record, type):
-        values = {field.name: getattr(record, field.name) for field in fields(record)}
-        return replace(record, **{n: _cut(field, tensors, leaves) for n, field in values.items()})
+        names = [field.name for field in fields(record)]
+        return replace(record, **{n: _cut(getattr(record, n), tensors, leaves) for n in names})
     return record
 
 
@@ -239,3 +245,166 @@ def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     ours = [gradient if is_first() else 0 * gradient for gradient in gradients.values()]
     return dict(zip(gradients, sum_over_ranks(ours), strict=True))
+
+
+class GraphRecorder:
+    """Records computations on a GPU as CUDA graphs, which a processor replays by one launch each.
+
+    They run in turn and share their memory, which goes with the last of them. A computation can be
+    recorded if Python reads none of its numbers and hands it none.
+    """
+
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
+
+    def __call__(self, computation: Callable[[], Any]) -> Recorded:
+        """What `computation` returns, not computed yet, and a function that computes it, in place.
+
+        Each replay overwrites its tensors. Raises RuntimeError where CUDA refuses to record.
+        """
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        # Constants, workspaces of libraries and modules of kernels are made in a run before.
+        with torch.cuda.stream(stream):
+            computation()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+            result = computation()
+        return result, graph.replay
+
+
+class Recording:
+    """The programs of iterations of `scene` with `values`, as `record` makes them.
+
+    `sums` are the derivatives by values and by the light's leaves, over the views of an iteration.
+    """
+
+    def __init__(
+        self, scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory, record: Record
+    ):
+        self.scene, self._record = scene, record
+        self.values = {
+            name: value.detach().clone().requires_grad_(value.requires_grad)
+            for name, value in values.items()
+        }
+        self.guesses = {key: solution.clone() for key, solution in memory.last.items()}
+        counts = {key: count + SPARE for key, count in memory.iterations.items()}
+        self.memory = SolveMemory(memory.is_warm, iterations=counts)
+        self.sums: list[Tensor] = []
+        _, self.follow_light = self._recorded(self._follow_light)
+        self.views: dict[tuple[str, float], Recorded] = {}
+        self.back: Recorded | None = None
+
+    def replay(
+        self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
+    ) -> Differentiated:
+        """The derivative by `values`, with the residuals of solves, which nobody has read."""
+        # By `data`, whose changes nobody counts: the way back was recorded with other numbers.
+        for name, value in self.values.items():
+            value.data.copy_(values[name].detach())
+        for solve, guess in self.guesses.items():
+            guess.copy_(memory.last[solve])
+        keys = [(view.name, compared.share(view)) for view in compared.views]
+        if not self.views.keys() >= set(keys):
+            # What is recorded runs once before: with the light of these values.
+            self.follow_light()
+        for key, view in zip(keys, compared.views, strict=True):
+            if key not in self.views:
+                self.views[key] = self._recorded(partial(self._view, view, compared))
+        self.back = self.back or self._recorded(self._follow_back)
+        # The light's program sets the sums to zero, to which views add.
+        self.follow_light()
+        images, loss = list[Tensor](), self.sums[0].new_zeros(())
+        for key, view in zip(keys, compared.views, strict=True):
+            result, follow_view = self.views[key]
+            follow_view()
+            image, view_loss, psnr = (tensor.clone() for tensor in result)
+            images.append(image)
+            loss = loss + view_loss
+            compared.note(view, image, view_loss, psnr)
+        bars, follow_back = self.back
+        follow_back()
+        gradients = {name: bar.clone() for name, bar in bars.items()}
+        memory.last |= {key: solution.clone() for key, solution in self.memory.last.items()}
+        records = [*self.light_records, *self.back_records]
+        memory.records.extend(records)
+        tolerance, floors = self.scene.diffusion.tolerance, memory.tolerance_floor
+        residuals = [
+            (torch.as_tensor(record.residual), max(tolerance, floors.get(record.kind, 0.0)))
+            for record in records
+            if record.kind != "rounds"
+        ]
+        return Differentiated(images, loss, gradients, residuals)
+
+    def _recorded(self, computation: Callable[[], Any]) -> Recorded:
+        with without_reads():
+            return self._record(computation)
+
+    def _follow_light(self) -> None:
+        self.memory.records, self.memory.last = [], dict(self.guesses)
+        self.cut = follow_light(self.scene, self.values, self.memory)
+        self.light_records = self.memory.records
+        self.sums = [torch.zeros_like(x) for x in (*self.values.values(), *self.cut.leaves)]
+
+    def _view(self, view: View, compared: Comparison) -> tuple[Tensor, Tensor, Tensor]:
+        image, loss, bars = differentiate_view(
+            self.cut, self.scene, self.values, view.name, compared.loss_of
+        )
+        for total, bar in zip(self.sums, bars, strict=True):
+            if bar is not None:
+                total.add_(bar)
+        return image, loss, compared.targets[view.name].psnr_of(image)
+
+    def _follow_back(self) -> dict[str, Tensor]:
+        self.memory.records = []
+        # Each run begins where the last iteration ended, also the second while it is recorded.
+        self.memory.last |= {key: u for key, u in self.guesses.items() if key[0] == "adjoint"}
+        count, values = len(self.values), list(self.values.values())
+        through = follow_back(self.cut.tensors, [*self.sums[count:]], values, is_last=False)
+        self.back_records = self.memory.records
+        return {
+            name: direct.clone() if bar is None else direct + bar
+            for name, direct, bar in zip(self.values, self.sums, through, strict=False)
+        }
+
+
+class Replays:
+    """Derivatives of iterations at one resolution, replayed from the second on where they can be.
+
+    What cannot be recorded is computed plainly, and a line says why.
+    """
+
+    def __init__(self, scene: Scene, new_recorder: Callable[[], Record] | None = None):
+        self.scene, self.new_recorder = scene, new_recorder
+        self.recording: Recording | None = None
+        settings = scene.diffusion
+        # Other models' solves look at each of their iterations, and ranks wait for each other.
+        is_fixed = settings.is_conservative_p1 or settings.model == "none"
+        if is_fixed and rank_count() == 1 and scene.volume.density.is_cuda:
+            self.new_recorder = GraphRecorder
+
+    def differentiate(
+        self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
+    ) -> Differentiated:
+        """As of `gradients.differentiate`, where `compared` compares the images of its views."""
+        # A plain iteration tells how many iterations solves take, but not of an empty volume.
+        counts = memory.iterations.values()
+        if self.new_recorder is not None and counts and all(counts):
+            try:
+                self.recording = self.recording or Recording(
+                    self.scene, values, memory, self.new_recorder()
+                )
+                return self.recording.replay(values, compared, memory)
+            except RuntimeError as error:
+                LOG.warning("iterations run without CUDA graphs: %s", str(error).split("\n")[0])
+                self.new_recorder = self.recording = None
+                compared.forget()
+        names = [view.name for view in compared.views]
+        return differentiate(self.scene, names, values, compared, memory)
+
+    def forget(self, compared: Comparison, memory: SolveMemory) -> None:
+        """Has the next iteration run plainly: a solve needs more iterations than were recorded."""
+        self.recording = None
+        memory.iterations.clear()
+        compared.forget()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -21,16 +20,15 @@ from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
-from ddrecon.reconstruct.metric import invert_metric
-from ddrecon.reconstruct.numbers import Numbers
+from ddrecon.reconstruct.metric import Numbers, apply_metric
 from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
-from ddrecon.reconstruct.search import Inverse, Objective, Search, Space, Values
+from ddrecon.reconstruct.search import Objective, Pair, Search, Space
 from ddrecon.reconstruct.setup import Level
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.legal import require_legal
+from ddrecon.variables.values import require_legal
 
 
 def optimize(
@@ -55,10 +53,10 @@ class Reconstruction:
     """A run of a `scene`: the `search` that moves its parameters, and the `schedule` that ends it.
 
     Its `frames` are that scene and `others`, which differ in their pictures: several of a film
-    share all parameters but their fields. `blocks` are the parameters of all, by their names in the
-    search, and `numbers` the single numbers among them. `diagonals` are the metric of fields and
-    maps; `rival` is the loss of images and the values that a trial has to beat. `problem`, `memory`
-    and `parameters` are those of the first frame.
+    share all parameters but their fields. `blocks` are the parameters of all, by frame and name,
+    whose entries follow each other in vectors; the single `numbers` among them come last.
+    `diagonal` is the metric of the other blocks; `rival` is the loss of images and the values
+    that a trial has to beat. `problem`, `memory` and `parameters` are those of the first frame.
     """
 
     def __init__(
@@ -68,22 +66,23 @@ class Reconstruction:
             require_legal(frame_scene)
         forget_changed()
         self.frames = [Frame(frame_scene, iterations) for frame_scene in (scene, *others)]
-        self.blocks: dict[str, Parameter] = {}
-        shared = {p.name: p for p in self.frames[0].parameters if not p.is_field}
+        first = self.frames[0]
+        self.memory, self.parameters, problem = first.memory, first.parameters, first.problem
+        self.problem = problem
+        self.shared = [p for p in self.parameters if not p.is_field]
+        names = {p.name: p for p in self.shared}
         for frame in self.frames:
-            frame.parameters = [shared.get(p.name, p) for p in frame.parameters]
-            self.blocks |= {self._key(frame, p): p for p in frame.parameters}
-        every, first = list(self.blocks.values()), self.frames[0]
-        problem = self.problem = first.problem
-        self.memory, self.parameters = first.memory, first.parameters
-        self.numbers = Numbers(problem.train, every)
-        stages = find_stages(len(problem.factors), problem.train, every)
+            frame.parameters = [names.get(p.name, p) for p in frame.parameters]
+        pairs = [(n, p) for n, frame in enumerate(self.frames) for p in frame.parameters]
+        self.numbers = Numbers(problem.train, self.parameters)
+        pairs.sort(key=lambda pair: pair[1] in self.numbers.places)
+        self.blocks = {_key(n, p): p for n, p in pairs}
+        stages = find_stages(len(problem.factors), problem.train, list(self.blocks.values()))
         self.schedule = Schedule(problem.settings.iterations, stages)
-        self.diagonals: Values = {}
-        self.space = Space(self._project, self._free, self._metric, self._group)
-        self.search = Search(self.space)
-        self.rival: tuple[float, Values] = (math.inf, {})
-        self._enter_stage()
+        self.rival: tuple[float, Tensor] = (math.inf, torch.empty(0))
+        for frame in self.frames:
+            frame.enter(self.schedule.stage.level)
+        self._begin_search([], [], 1.0)
 
     @property
     def iteration(self) -> int:
@@ -95,22 +94,31 @@ class Reconstruction:
         """Whether all iterations have been made, or what ends the run by itself has come."""
         return self.schedule.is_over(self.iteration)
 
+    @property
+    def level(self) -> Level:
+        """The problem at the current resolution."""
+        return self.frames[0].level
+
+    @property
+    def total(self) -> Row:
+        """The running totals of the log."""
+        return self.frames[0].total
+
     def advance(self) -> list[Row]:
         """The log's rows, one of each frame, of one more iteration: one candidate of the search.
 
         Raises DivergenceError when nothing can be evaluated. The state is then that before the
         iteration.
         """
-        start = perf_counter()
-        candidate, evaluations = self._evaluate_candidate()
-        objective = self._add_up(candidate, evaluations)
-        if not self.search.values:
+        start, search = perf_counter(), self.search
+        evaluations = self._evaluate_candidate()
+        objective = self._add_up(evaluations)
+        if search.is_new:
             self._find_metric(evaluations)
-        weight = self.search.weight
-        is_accepted = self.search.judge(candidate, objective)
-        self._put(self.search.values)
+        weight, is_accepted = search.weight, search.judge(objective)
+        self._put(search.values)
         stage, number = self.schedule.stage, self.schedule.progress.stage
-        self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
+        self.schedule.note(self.iteration + 1, search, self.noise_loss)
         is_over = self.schedule.is_over(self.iteration + 1)
         fraction = self.problem.settings.keep_start
         if fraction and is_over:
@@ -127,24 +135,9 @@ class Reconstruction:
         if self.schedule.progress.stage != number:
             self._pass_trial(is_over=stage.is_trial)
             if stage.is_trial or self.schedule.stage.level == stage.level:
-                self.search.pairs = []  # the metric of what is there finds other directions
+                search.pairs = []  # the metric of what is there finds other directions
             self._enter_stage()
         return rows
-
-    @property
-    def shared(self) -> list[Parameter]:
-        """The parameters that all frames have in common."""
-        return [p for p in self.blocks.values() if not p.is_field]
-
-    @property
-    def level(self) -> Level:
-        """The problem at the current resolution."""
-        return self.frames[0].level
-
-    @property
-    def total(self) -> Row:
-        """The running totals of the log."""
-        return self.frames[0].total
 
     def step(self) -> Row:
         """The log's row of one more iteration; raises DivergenceError as `advance` does."""
@@ -172,161 +165,165 @@ class Reconstruction:
             "progress": asdict(self.schedule.progress),
             "search": self.search.state(),
             "rival": self.rival,
-            "diagonals": self.diagonals,
+            "diagonal": self.diagonal,
             "numbers": (self.numbers.matrix, self.numbers.prior),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up where the run that made `state` stopped."""
+        """Takes up where the run that made `state` stopped, on whatever device that was."""
+        self.numbers.matrix, self.numbers.prior = state["numbers"]
+        state = _as(self.problem.scene.volume.density, dict(state))
         self.schedule.progress = Progress(**state["progress"])
         for frame, of_frame in zip(self.frames, state["frames"], strict=True):
-            frame.restore(of_frame)
-        self._enter_stage()
-        for frame, of_frame in zip(self.frames, state["frames"], strict=True):
-            frame.restore_solutions(of_frame)
-        like = {key: p.value for key, p in self.blocks.items()}
-        self.search.restore(state["search"], like)
-        self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
-        loss, values = state["rival"]
-        self.rival = loss, {key: value.to(like[key]) for key, value in values.items()}
-        self.numbers.matrix, self.numbers.prior = state["numbers"]
+            frame.restore(of_frame, self.schedule.stage.level)
+        self._begin_search([], [], 1.0)
+        self.search.restore(state["search"])
+        self.rival, self.diagonal = state["rival"], state["diagonal"]
 
     def _pass_trial(self, is_over: bool) -> None:
         """Begins a trial of denser fields where one is due; ends one that `is_over`."""
         loss, values = self.rival
         if is_over and self.search.objective.loss > tuning.BETTER * loss:
             self._put(values)
-        self.rival = math.inf, {}
         if self.schedule.stage.is_trial:
             self.rival = self.search.objective.loss, self.search.values
-            denser = {
-                key: value * (tuning.DENSER if self.blocks[key].key == "density" else 1)
-                for key, value in self.search.values.items()
-            }
+            denser = self._map(
+                lambda p, value: value * (tuning.DENSER if p.key == "density" else 1),
+                self.search.values,
+            )
             self._put(self._project(denser))
 
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""
+        pairs = [[self._split(vector) for vector in pair] for pair in self.search.pairs]
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
-        self.diagonals = {}
+
+        def carry(entries: Sequence[Tensor], is_slope: bool) -> Tensor:
+            carried = zip(self.blocks.values(), entries, strict=True)
+            return torch.cat([p.carry(entry, is_slope).flatten() for p, entry in carried])
+
         # How the objective bends, and how long the metric is, hardly changes with resolution.
-        pairs = [
-            (self._carry(move), self._carry(of_loss, True), self._carry(of_prior, True))
-            for move, of_loss, of_prior in self.search.pairs
-        ]
-        scales, weight = self.search.scales, self.search.weight
-        self.search = Search(self.space, scales=scales, weight=weight, pairs=pairs)
+        carried = [(carry(a, False), carry(b, True), carry(c, True)) for a, b, c in pairs]
+        self._begin_search(carried, self.search.scales, self.search.weight)
+
+    def _begin_search(self, pairs: list[Pair], scales: list[float], weight: float) -> None:
+        self.diagonal = torch.empty(0)
+        fields = [p.value for p in self.blocks.values() if p not in self.numbers.places]
+        sizes = [value.numel() for value in fields] + [self.numbers.size] * bool(self.numbers.size)
+        start = self._project(self._map(lambda p: p.value.detach()))
+        space = Space(self._project, self._free, self._metric, sizes)
+        self.search: Search = Search(space, start, weight, pairs, scales)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
-    def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
-        """The next candidate whose objective can be evaluated, and that of each frame."""
-        before = self.search.state()
+    def _evaluate_candidate(self) -> list[Evaluation]:
+        """The next candidate that can be evaluated, by each frame."""
+        search, before = self.search, self.search.state()
         while True:
-            is_first = not self.search.values
-            candidate = self._project(self._values()) if is_first else self.search.candidate
-            self._put(candidate)
+            self._put(search.candidate)
             try:
-                return candidate, [frame.evaluate() for frame in self.frames]
+                return [frame.evaluate() for frame in self.frames]
             except (SolveError, NotFiniteError) as error:
-                every = list(self.blocks.values())
-                failure = explain_divergence(self.iteration + 1, every, error)
-                if not is_first:
+                failure = explain_divergence(self.iteration + 1, list(self.blocks.values()), error)
+                if not search.is_new:
                     # Light that cannot be solved for is as bad as light that is far off.
-                    self.search.judge(candidate, Objective(math.inf, 0.0, {}, {}))
-                    self._put(self.search.values)
-                if is_first or self.search.is_stuck:
-                    self.search.restore(before, candidate)
+                    search.shorten(math.inf)
+                if search.is_new or search.is_stuck:
+                    search.restore(before)
+                    self._put(search.values)
                     raise failure from error.__cause__
             except RanksError:
-                self._put(candidate if is_first else self.search.values)
+                self._put(search.values)
                 raise
 
-    def _add_up(self, candidate: Values, evaluations: Sequence[Evaluation]) -> Objective:
-        """The objective of all frames, with what calibrations say."""
-        loss, gradients = self.numbers.penalty(candidate)
-        prior, prior_gradients = 0.0, dict[str, Tensor]()
-        for frame, evaluation in zip(self.frames, evaluations, strict=True):
-            objective = evaluation.objective
-            loss, prior = loss + objective.loss, prior + objective.prior
-            for p in frame.parameters:
-                key, bar = self._key(frame, p), objective.gradients[p.name]
-                gradients[key] = gradients[key] + bar if key in gradients else bar
-                if p.name in objective.prior_gradients:
-                    prior_gradients[key] = objective.prior_gradients[p.name]
-        return Objective(loss, from_first(prior), gradients, prior_gradients)
+    def _add_up(self, evaluations: Sequence[Evaluation]) -> Objective:
+        """The objective of all frames at the candidate, with what calibrations say."""
+        gradient = self._gather([e.gradients for e in evaluations])
+        penalty = self.numbers.add_penalty(self.search.candidate, gradient)
+        return Objective(
+            penalty + sum(e.loss for e in evaluations),
+            from_first(sum(e.prior for e in evaluations)),
+            gradient,
+            self._gather([e.prior_gradients for e in evaluations]),
+        )
 
     def _find_metric(self, evaluations: Sequence[Evaluation]) -> None:
         """Takes the metric where the parameters stand."""
-        compared = [evaluation.compared for evaluation in evaluations]
-        pairs = list(zip(self.frames, compared, strict=True))
-        for frame, comparison in pairs:
-            blocks = [p for p in frame.parameters if p not in self.numbers.places]
-            diagonals = frame.find_diagonals(blocks, comparison)
-            for p in blocks:
-                # Maps are shared: what all frames tell of a map adds up.
-                key, diagonal = self._key(frame, p), diagonals[p.name]
-                known = self.diagonals.get(key)
-                self.diagonals[key] = diagonal if known is None else known + diagonal
+        pairs = list(zip(self.frames, evaluations, strict=True))
+        fields = [p.name for p in self.parameters if p not in self.numbers.places]
+        self.diagonal = self._gather([f.find_diagonals(fields, e.compared) for f, e in pairs])
         if not self.schedule.stage.waiting:
-            self.numbers.prepare([frame.point(comparison) for frame, comparison in pairs])
+            self.numbers.prepare([frame.point(e.compared) for frame, e in pairs])
 
-    def _project(self, values: Values) -> Values:
-        projected = {key: p.project(values[key]) for key, p in self.blocks.items()}
-        return projected | self.numbers.hold_gauges(projected)
+    def _project(self, values: Tensor) -> Tensor:
+        return self.numbers.hold_gauges(self._map(Parameter.project, values))
 
-    def _free(self, values: Values, gradients: Values) -> Values:
+    def _free(self, values: Tensor, gradient: Tensor) -> Tensor:
         waiting = self.schedule.stage.waiting
-        return {
-            key: torch.zeros_like(values[key])
-            if p.name in waiting
-            else p.free(values[key], gradients[key])
-            for key, p in self.blocks.items()
-        }
 
-    def _group(self, key: str) -> str:
-        """The group of a parameter in the metric: that of all numbers is one."""
-        return "numbers" if self.blocks[key] in self.numbers.places else key
+        def free(p: Parameter, value: Tensor, slope: Tensor) -> Tensor:
+            return torch.zeros_like(value) if p.name in waiting else p.free(value, slope)
 
-    def _metric(self, values: Values, free: Values) -> Inverse:
-        """The inverse metric at `values`, of what is `free`."""
-        waiting, weight = self.schedule.stage.waiting, self.search.weight
-        inverses = dict[str, Callable[[Tensor], Tensor]]()
-        for key, diagonal in self.diagonals.items():
-            p, is_free = self.blocks[key], free[key]
+        return self._map(free, values, gradient)
+
+    def _metric(self, values: Tensor, free: Tensor, vectors: Tensor) -> Tensor:
+        """The inverse metric at `values`, of what is `free`, times `vectors` [m, n]."""
+        waiting, weight, results = self.schedule.stage.waiting, self.search.weight, list[Tensor]()
+        entries = zip(*map(self._split, (values, free, self.diagonal)), strict=True)
+        fields = [p for p in self.blocks.values() if p not in self.numbers.places]
+        columns = vectors.split(self.search.space.sizes, 1)
+        blocks = zip(fields, entries, columns, strict=False)  # numbers come last
+        for p, (value, is_free, diagonal), column in blocks:
+            residuals = column.reshape(-1, *value.shape)
             if p.tv and p.name not in waiting:
-                inverses[key] = invert_metric(p, values[key], diagonal, weight, is_free)
+                moves = apply_metric(p, value, diagonal, weight, is_free, residuals)
             else:
-                inverses[key] = partial(torch.mul, is_free / diagonal)
+                moves = residuals * (is_free / diagonal)
+            results.append(moves.flatten(1))
+        if self.numbers.size:
+            results.append(self.numbers.precondition(values, free, vectors))
+        return torch.cat(results, 1)
 
-        def precondition(vectors: Sequence[Values]) -> list[Values]:
-            fields = {
-                key: invert(torch.stack([vector[key] for vector in vectors]))
-                for key, invert in inverses.items()
-            }
-            return [
-                {key: bars[n] for key, bars in fields.items()}
-                | self.numbers.precondition(vector, free)
-                for n, vector in enumerate(vectors)
-            ]
+    def _put(self, values: Tensor) -> None:
+        for p, value in zip(self.blocks.values(), self._split(values), strict=True):
+            p.value = value.detach().requires_grad_()
 
-        return precondition
+    def _split(self, vector: Tensor) -> list[Tensor]:
+        """The entries of each block in a `vector`, in its shape."""
+        blocks = [p.value for p in self.blocks.values()]
+        entries = vector.split([value.numel() for value in blocks])
+        return [entry.view(value.shape) for entry, value in zip(entries, blocks, strict=True)]
 
-    def _values(self) -> Values:
-        return {key: p.value.detach() for key, p in self.blocks.items()}
+    def _map(self, function: Callable[..., Tensor], *vectors: Tensor) -> Tensor:
+        """What `function` makes of each parameter, and of its entries in `vectors`, as a vector."""
+        entries = zip(self.blocks.values(), *map(self._split, vectors), strict=True)
+        return torch.cat([function(*block).flatten() for block in entries])
 
-    def _put(self, values: Values) -> None:
-        for key, p in self.blocks.items():
-            p.value = values[key].detach().requires_grad_()
+    def _gather(self, of_frames: Sequence[Mapping[str, Tensor]]) -> Tensor:
+        """The sum of each frame's tensors, by parameter, as a vector; what is missing is 0."""
+        sums: dict[tuple[int, str], Tensor] = {}
+        for n, (frame, tensors) in enumerate(zip(self.frames, of_frames, strict=True)):
+            for p in frame.parameters:
+                if p.name in tensors:
+                    key, tensor = _key(n, p), tensors[p.name]
+                    sums[key] = sums[key] + tensor if key in sums else tensor
+        blocks = self.blocks.items()
+        entries = (sums[k] if k in sums else torch.zeros_like(p.value) for k, p in blocks)
+        return torch.cat([entry.flatten() for entry in entries])
 
-    def _carry(self, vector: Values, is_slope: bool = False) -> Values:
-        """Moves, or derivatives, carried to the resolution of the parameters."""
-        return {key: self.blocks[key].carry(entry, is_slope) for key, entry in vector.items()}
 
-    def _key(self, frame: Frame, p: Parameter) -> str:
-        """The search's name of a parameter of `frame`: fields are each frame's own."""
-        is_shared = len(self.frames) == 1 or not p.is_field
-        return p.name if is_shared else f"frame {self.frames.index(frame)} {p.name}"
+def _key(number: int, p: Parameter) -> tuple[int, str]:
+    """The search's name of a parameter of frame `number`: fields are each frame's own."""
+    return (number if p.is_field else 0), p.name
+
+
+def _as(like: Tensor, entry: Any) -> Any:
+    """`entry` with all tensors in it on the device and in the precision of `like`."""
+    if isinstance(entry, dict):
+        return {name: _as(like, value) for name, value in entry.items()}
+    if isinstance(entry, list | tuple):
+        return type(entry)(_as(like, item) for item in entry)
+    return entry.to(like) if isinstance(entry, Tensor) else entry
 
 
 BEGUN = 2

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -174,4 +174,4 @@ class Parameter:
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = replace(self.grid, shape=tuple(state["shape"]))
-        self.value = state["value"].to(self.value).clone().requires_grad_()
+        self.value = state["value"].clone().requires_grad_()

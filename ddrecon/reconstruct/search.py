@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any
 
 import torch
@@ -21,73 +20,76 @@ from torch import Tensor
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 
-Values = dict[str, Tensor]
-"""Tensors by the name of their parameter."""
-Inverse = Callable[[Sequence[Values]], list[Values]]
-"""The inverse of a metric, as a function of several vectors."""
+Pair = tuple[Tensor, Tensor, Tensor]
+"""A move, and the changes of the derivatives of the loss and of the prior by it, [n] each."""
 
 
 @dataclass(frozen=True)
 class Space:
-    """Where the search goes: what it asks about values by name.
+    """Where the search goes: what it asks about vectors of all unknowns [n].
 
-    `project` brings values back within bounds, `free` is 1 where an entry may move at values and
-    their derivative, and `metric` is taken at values and what is free there: its inverse, of that,
-    is a function of derivatives. It mixes no values of one `group` with those of another.
+    `project` brings values back within bounds, and `free` is 1 where an entry may move at values
+    and their derivative, else 0. `metric` is the inverse of a metric, at values and what is free
+    there, times vectors [m, n]. It mixes no entries of different groups, which are `sizes` long.
     """
 
-    project: Callable[[Values], Values]
-    free: Callable[[Values, Values], Values]
-    metric: Callable[[Values, Values], Inverse]
-    group: Callable[[str], str] = str
+    project: Callable[[Tensor], Tensor]
+    free: Callable[[Tensor, Tensor], Tensor]
+    metric: Callable[[Tensor, Tensor, Tensor], Tensor]
+    sizes: Sequence[int]
 
 
 @dataclass(frozen=True)
 class Objective:
-    """The `loss` and the `prior` at some values, and their derivatives by name."""
+    """The `loss` and the `prior` at some values, and their derivatives [n]."""
 
     loss: float
     prior: float
-    gradients: Values
-    prior_gradients: Values
+    gradient: Tensor
+    prior_gradient: Tensor
 
     def total(self, weight: float) -> float:
         """Both, the prior by its `weight`."""
         return self.loss + weight * self.prior
 
-    def slopes(self, weight: float) -> Values:
-        """The derivatives of the total."""
-        return _combine(self.gradients, self.prior_gradients, weight)
+    def slope(self, weight: float) -> Tensor:
+        """The derivative of the total."""
+        return self.gradient.add(self.prior_gradient, alpha=weight)
 
 
 @dataclass
 class Search:
     """The state of a search in `space`: plain numbers and tensors, which checkpoints keep.
 
-    `values` are the last candidate accepted, none at first, and `objective` what was found there.
-    The prior counts by `weight`. `pairs` are the last accepted moves and the changes of both
-    derivatives. The next `candidate` is `step` times `direction` away, within bounds, which is a
-    `move`. As far as derivatives tell, the loss falls by `slope` along that direction and by
-    `promise` in that move; `is_stuck` where no step helps. `scales` are how long the metric is, by
-    group of values, as the last pair had it. `gains` are what the loss could still fall by, as part
-    of it, at the last values. `moves`: how many candidates were accepted after the first.
+    `values` are the last candidate accepted, and `objective` is that there: unknown, and infinite,
+    at the first. The prior counts by `weight`. `pairs` are those of the last moves. The next
+    `candidate` is `step` times `direction` away, within bounds. As far as derivatives tell, the
+    loss falls by `slope` along that direction and by `promise` in that move; `is_stuck` where no
+    step helps. `scales` are how long the metric is, by group, as the last pair had it. `gains` are
+    what the loss could still fall by, as part of it, at the last values. `moves`: how many
+    candidates were accepted after the first.
     """
 
     space: Space
-    values: Values = field(default_factory=dict)
-    objective: Objective = Objective(math.inf, 0.0, {}, {})
+    values: Tensor
     weight: float = 1.0
-    pairs: list[tuple[Values, Values, Values]] = field(default_factory=list)
-    direction: Values = field(default_factory=dict)
-    candidate: Values = field(default_factory=dict)
-    move: Values = field(default_factory=dict)
+    pairs: list[Pair] = field(default_factory=list)
+    scales: list[float] = field(default_factory=list)
     slope: float = 0.0
     promise: float = 0.0
     step: float = 1.0
-    scales: dict[str, float] = field(default_factory=dict)
     gains: list[float] = field(default_factory=list)
     is_stuck: bool = False
     moves: int = 0
+
+    def __post_init__(self) -> None:
+        self.objective = Objective(math.inf, 0.0, self.values, self.values)
+        self.candidate = self.direction = self.values
+
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing has been evaluated yet."""
+        return self.objective.loss == math.inf
 
     @property
     def gain(self) -> float:
@@ -105,24 +107,24 @@ class Search:
         """The objective at the values accepted last."""
         return self.objective.total(self.weight)
 
-    def judge(self, values: Values, objective: Objective) -> bool:
-        """Takes in the `objective` at the candidate `values`; returns whether it is accepted.
+    def judge(self, objective: Objective) -> bool:
+        """Takes in the `objective` at the candidate; returns whether that is accepted.
 
         A loss that is not finite is as if it were too large.
         """
-        if self.values:
+        if not self.is_new:
             loss = objective.total(self.weight)
             if not loss <= self.loss + tuning.SUFFICIENT * self.promise:
-                self._shorten(loss)
+                self.shorten(loss)
                 return False
             old = self.objective
             changes = (
-                _combine(objective.gradients, old.gradients, -1),
-                _combine(objective.prior_gradients, old.prior_gradients, -1),
+                objective.gradient - old.gradient,
+                objective.prior_gradient - old.prior_gradient,
             )
-            self.pairs = [*self.pairs, (self.move, *changes)][-tuning.PAIRS :]
+            self.pairs = [*self.pairs, (self.candidate - self.values, *changes)][-tuning.PAIRS :]
             self.moves += 1
-        self.values, self.objective = values, objective
+        self.values, self.objective = self.candidate, objective
         self.aim()
         return True
 
@@ -133,12 +135,14 @@ class Search:
 
     def aim(self) -> None:
         """Sets out anew from the values accepted last."""
-        gradients = self.objective.slopes(self.weight)
-        free = self.space.free(self.values, gradients)
-        self.direction, ratios = self._find_direction(gradients, free)
-        slope, *lengths = self._set_out(1.0, _dot(self.direction, gradients), *ratios.values())
-        measured = zip(ratios, lengths, strict=True)
-        self.scales |= {group: length for group, length in measured if 0 < length < math.inf}
+        gradient = self.objective.slope(self.weight)
+        self.direction, ratios = self._find_direction(gradient)
+        slope, *lengths = self._set_out(1.0, _dot(self.direction, gradient), *ratios)
+        is_length = [0 < length < math.inf for length in lengths]
+        if any(is_length):
+            known = self.scales or [1.0] * len(lengths)
+            measured = zip(is_length, lengths, known, strict=True)
+            self.scales = [length if is_sure else old for is_sure, length, old in measured]
         self.slope = min(slope, 0.0)
         self.is_stuck = self.slope == 0
         if not (self.scales or self.is_stuck):
@@ -152,113 +156,72 @@ class Search:
 
         All ranks decide by those of the first.
         """
-        moved = {n: torch.add(v, self.direction[n], alpha=step) for n, v in self.values.items()}
-        self.step, self.candidate = step, self.space.project(moved)
-        self.move = {name: value - self.values[name] for name, value in self.candidate.items()}
-        promise = _dot(self.move, self.objective.slopes(self.weight))
+        self.step = step
+        self.candidate = self.space.project(self.values.add(self.direction, alpha=step))
+        promise = _dot(self.candidate - self.values, self.objective.slope(self.weight))
         self.promise, *others = from_first(torch.stack([promise, *numbers]).tolist())
         return others
 
-    def _shorten(self, loss: float) -> None:
-        """Shortens the step to where the parabola through what is known is lowest."""
+    def shorten(self, loss: float) -> None:
+        """Refuses the candidate, whose `loss` is too large, and tries a shorter step.
+
+        It goes to where the parabola through what is known is lowest.
+        """
         excess = loss - self.loss - self.promise
         factor = -self.promise / (2 * excess) if excess > 0 and math.isfinite(excess) else 0.5
         self.step *= min(max(factor, 0.1), 0.5)
         if self.step >= tuning.SHORTEST:
             self._set_out(self.step)
-        else:
-            self.is_stuck = not self.pairs
+        elif self.pairs:
             self.pairs = []
-            if not self.is_stuck:
-                self.aim()
+            self.aim()
+        else:
+            self.is_stuck = True
 
-    def _find_direction(self, gradients: Values, free: Values) -> tuple[Values, dict[str, Tensor]]:
-        """Minus the inverse Hessian, as pairs have it, times the `gradients` of what is free.
+    def _find_direction(self, gradient: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Minus the inverse Hessian, as pairs have it, times the `gradient` of what is free.
 
-        And how long the last pair has the metric, by group; where that is no length, the one known
-        is taken.
+        And how long the last pair has the metric, by group: the metric knows directions, and errs
+        by a factor of its own in each. Where that is no length, the one known is taken.
         """
-        residual = {name: bar * free[name] for name, bar in gradients.items()}
-        pairs = list[tuple[Values, Values, Tensor]]()
+        free = self.space.free(self.values, gradient)
+        pairs = list[tuple[Tensor, Tensor, Tensor]]()
         for move, of_loss, of_prior in self.pairs:
-            change = _combine(of_loss, of_prior, self.weight)
-            change = {name: bar * free[name] for name, bar in change.items()}
+            change = of_loss.add(of_prior, alpha=self.weight) * free
             curvature = _dot(move, change)
             pairs.append((move, change, ((curvature > 0) / curvature).nan_to_num()))
-        weights = list[Tensor]()
+        residual, weights = gradient * free, list[Tensor]()
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))
-            residual = _add(residual, change, weights[-1], -1)
+            residual = residual.addcmul(change, weights[-1], value=-1)
         # The last change goes along: for a GPU two vectors are as many launches as one.
-        vectors = [residual, *(change for _, change, _ in pairs[-1:])]
-        result, *promised = self.space.metric(self.values, free)(vectors)
-        ratios = self._measure(*pairs[-1][:2], *promised) if promised else {}
-        for name, value in result.items():
-            group = self.space.group(name)
-            length = self.scales.get(group, 1.0)
-            if group in ratios:
-                measured = torch.where(ratios[group] > 0, ratios[group], length)
-                result[name] = value * (measured if value.ndim else measured.to(value))
-            else:
-                result[name] = value * length
+        vectors = torch.stack([residual, *(change for _, change, _ in pairs[-1:])])
+        result, *promised = self.space.metric(self.values, free, vectors)
+        sizes, ratios = self.space.sizes, list[Tensor]()
+        lengths: Sequence[float | Tensor] = self.scales or [1.0] * len(sizes)
+        for product in promised:
+            groups = zip(*(x.split(sizes) for x in (*pairs[-1][:2], product)), strict=True)
+            ratios = [_dot(change, move) / _dot(change, own) for move, change, own in groups]
+            known = zip(ratios, lengths, strict=True)
+            lengths = [torch.where(ratio > 0, ratio, length) for ratio, length in known]
+        scaled = zip(result.split(sizes), lengths, strict=True)
+        result = torch.cat([group * length for group, length in scaled])
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
-            result = _add(result, move, weight - inverse * _dot(change, result))
-        return {name: -free[name] * value for name, value in result.items()}, ratios
-
-    def _measure(self, move: Values, change: Values, promised: Values) -> dict[str, Tensor]:
-        """The metric's length by group, from a `move` and the one `promised` for its `change`.
-
-        The metric knows directions; of fields and of numbers it errs by different factors.
-        """
-        names: dict[str, list[str]] = {}
-        for name in move:
-            names.setdefault(self.space.group(name), []).append(name)
-        of_groups = {
-            group: {name: change[name] for name in members} for group, members in names.items()
-        }
-        return {g: _dot(bars, move) / _dot(bars, promised) for g, bars in of_groups.items()}
+            result = result.addcmul(move, weight - inverse * _dot(change, result))
+        return -free * result, ratios
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         state = {name: value for name, value in vars(self).items() if name != "space"}
         return state | {"objective": dict(vars(self.objective))}
 
-    def restore(self, state: Mapping[str, Any], like: Mapping[str, Tensor]) -> None:
-        """Takes up a `state`, on the device and in the precision of tensors `like` its values."""
-
-        def put(entry: Any) -> Any:
-            if isinstance(entry, dict):
-                return {name: put(value) for name, value in entry.items()}
-            if isinstance(entry, list | tuple):
-                return type(entry)(put(item) for item in entry)
-            return entry.to(first) if isinstance(entry, Tensor) else entry
-
-        first = next(iter(like.values()))
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes up a `state`."""
         for name, entry in state.items():
-            setattr(self, name, put(entry))
-        self.objective = Objective(**put(state["objective"]))
+            setattr(self, name, entry)
+        self.objective = Objective(**state["objective"])
 
 
-def _dot(first: Values, second: Values) -> Tensor:
+def _dot(first: Tensor, second: Tensor) -> Tensor:
     """The sum of products of entries, in float64."""
-    products = [(bar * second[name]).sum(dtype=torch.float64) for name, bar in first.items()]
-    return reduce(torch.add, products)
-
-
-def _combine(first: Values, second: Values, weight: float) -> Values:
-    """The sum of `first` and `weight` times `second`, in which what is missing is 0."""
-    return {
-        name: torch.add(bar, second[name], alpha=weight) if name in second else bar
-        for name, bar in first.items()
-    }
-
-
-def _add(total: Values, addend: Values, weight: Tensor, sign: int = 1) -> Values:
-    """The sum of `total` and `weight` times `addend`, or their difference."""
-
-    def of_type(value: Tensor) -> Tensor:
-        return (
-            weight if value.ndim else weight.to(value)
-        )  # two plain numbers would be of the larger
-
-    return {n: torch.addcmul(v, addend[n], of_type(v), value=sign) for n, v in total.items()}
+    return (first * second).sum(dtype=torch.float64)

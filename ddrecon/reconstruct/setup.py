@@ -1,4 +1,4 @@
-"""The start of a reconstruction: its views, its parameters, and whether they are usable."""
+"""What a run begins with: its views and parameters, if they are usable; coarse to fine."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch.nn.functional import adaptive_avg_pool2d
 
+from ddrecon.cameras import CELL, cell_width
 from ddrecon.errors import FormatError, SceneError, UsageError
+from ddrecon.grid import Grid
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
-from ddrecon.pictures.noise import Noise, estimate_noise
-from ddrecon.reconstruct.levels import factors, scene_at_level
+from ddrecon.medium.coefficients import resample, volume_at_level
+from ddrecon.pictures import Noise, estimate_noise
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import describe_flaw, target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.support import Support, find_support
@@ -221,3 +225,48 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
     if len(fields) == 1 and settings.parameters[fields[0].name].tv is None:
         fields[0].tv *= kind_of(fields[0].name).alone
     return parameters
+
+
+def factors(scene: Scene) -> list[int]:
+    """The coarsening factor of each level of resolution, coarsest first, the last of them 1.
+
+    They are powers of two that leave the grid's shortest side `FEWEST_CELLS`.
+    """
+    most = max(min(scene.volume.grid.shape) // tuning.FEWEST_CELLS, 1)
+    return [2**k for k in reversed(range(most.bit_length()))]
+
+
+def scene_at_level(scene: Scene, factor: int) -> Scene:
+    """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged.
+
+    A pixel is the mean of those in it that count, and counts where more than half of them do.
+    Of pixels it has as many fewer again as leave a cell `CELL` of them wide: more say no more.
+    """
+    views = [_view_at_level(view, factor, scene.volume.grid) for view in scene.views]
+    if factor == 1:
+        return replace(scene, views=views)
+    volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
+    coarse = volume_at_level(volume, grid)
+    starts = {
+        name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
+        for name, start in scene.starts.items()
+    }
+    return replace(scene, volume=coarse, views=views, starts=starts)
+
+
+def _view_at_level(view: View, factor: int, grid: Grid) -> View:
+    """`view` with up to `factor` times fewer pixels a side than cells of `grid` ask for."""
+    factor *= max(1, int(cell_width(grid, view.camera) / CELL))
+    most = max(1, min(factor, min(view.camera.size) // tuning.FEWEST_PIXELS))
+    if most == 1:
+        return view
+    camera, image, mask = view.camera.resize(most), view.image, view.mask
+    background = view.background
+    if background is not None and background.shape[1:] != (1, 1):
+        background = adaptive_avg_pool2d(background, camera.size)
+    share = None if mask is None else adaptive_avg_pool2d(mask[None], camera.size)[0]
+    if image is not None:
+        image = adaptive_avg_pool2d(image if mask is None else image * mask, camera.size)
+        image = image if share is None else image / share.where(share > 0, 1)
+    mask = None if share is None else (share > 0.5).to(share.dtype)
+    return replace(view, camera=camera, image=image, mask=mask, background=background)

@@ -22,7 +22,7 @@ from ddrecon.hull import (
     find_shown,
     hull_of,
 )
-from ddrecon.march.box import Crossing, cross_box
+from ddrecon.march.samplers import Crossing, cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 

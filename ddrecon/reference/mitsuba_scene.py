@@ -24,9 +24,9 @@ from torch.nn.functional import interpolate
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.light.environment import rotate_directions
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.sky import rotate_directions
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Mixture, PhaseFunction, Rayleigh
 from ddrecon.scene import Scene, View
@@ -188,8 +188,7 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
         weight = complement.item() if phase.cells is None else _grid_volume(complement, grid)
         return {"type": "blendphase", "weight": weight, "first": first, "second": second}
     cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
-    numbers = (number.detach().cpu().double() for number in phase.numbers)
-    values = phase.kind(*numbers).value(cosines)
+    values = phase.map(lambda number: number.detach().cpu().double()).value(cosines)
     return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
 
 
@@ -323,7 +322,7 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:
-    """The map turned as `ddrecon.light.environment` says, which holds `ambient` [3] as well."""
+    """The map turned as `ddrecon.light.sky` says, which holds `ambient` [3] as well."""
     radiance = (light.scale * light.radiance).detach().cpu().double().numpy()
     pixels = np.broadcast_to(radiance.transpose(1, 2, 0), (*radiance.shape[1:], 3)) + ambient
     turn = np.eye(4)

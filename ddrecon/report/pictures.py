@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ddrecon.pictures.srgb import decode
+from ddrecon.pictures import decode
 
 ENLARGED = 4
 """Differences are shown this many times enlarged, around mid-gray."""

@@ -23,7 +23,7 @@ from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
-from ddrecon.pictures.scales import COMPARED, LINEAR
+from ddrecon.pictures import COMPARED, LINEAR
 from ddrecon.progress import show_progress
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
@@ -33,7 +33,7 @@ from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.kinds import is_of_volume, pose_change
-from ddrecon.variables.values import extinction_of, value_of, with_values
+from ddrecon.variables.values import extinction_of, fields_of, value_of, with_values
 
 STEPS = 8
 """The most steps; they end when one improves nothing."""
@@ -215,11 +215,29 @@ def diagnose(
         )
     if support is not None:
         doubt = f"volume.bounds? {doubt}" if doubt else find_cut(support, scene.volume.grid)
-    # What is overfit would only become more so.
-    unfinished = None if overfit else find_unfinished(gain, iteration)
-    texts = {"overfit": overfit, "support": doubt}
-    texts |= find_odd(train, findings.images, gain) | {"unfinished": unfinished}
+    texts = {"empty": find_empty(scene, iteration, gain), "overfit": overfit, "support": doubt}
+    if not texts["empty"]:
+        texts |= find_odd(train, findings.images, gain)
+    if not (texts["empty"] or overfit):  # which would only become more so
+        texts["unfinished"] = find_unfinished(gain, iteration)
     return [{"kind": kind, "text": text} for kind, text in texts.items() if text]
+
+
+def find_empty(scene: Scene, iteration: int, gain: float) -> str | None:
+    """Whether nothing is in the volume of `scene`, and why, as far as the run can see.
+
+    Of a run that cannot see any smoke, for its lights, cameras or masks, the scene is refused.
+    """
+    shining = [v for n, v in fields_of(scene).items() if n.endswith(("density", "emission"))]
+    if any(bool(value.any()) for value in shining):
+        return None
+    if gain == math.inf:
+        reason = f"the run ended after {iteration} iterations, before anything moved"
+        return f"empty: {reason}; go on with --resume --iterations auto"
+    return (
+        "empty: no smoke that was tried brings renders nearer to the pictures than what is behind "
+        "the box; check the directions of lights, cameras, masks and the bounds of density"
+    )
 
 
 def find_odd(views: Sequence[View], images: Mapping[str, Tensor], gain: float) -> dict[str, str]:

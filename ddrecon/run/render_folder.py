@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import UsageError, suggestion
+from ddrecon.errors import UsageError
 from ddrecon.extras import advice, load_for_file
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
@@ -30,21 +30,17 @@ from ddrecon.io.images.table import (
 from ddrecon.light_field import LightField, fluence_of
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
-from ddrecon.medium.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.picture import view_components, view_matte, view_picture
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 from ddrecon.progress import show_progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.job import Outcome
 from ddrecon.run.run_folder import write_volume
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, place_turntable
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import place_turntable
 from ddrecon.variables.values import (
-    component_names,
-    value_of,
-    variable_names,
     variation,
     varied,
 )
@@ -93,10 +89,7 @@ def choose_views(scene: Scene, choice: Choice) -> tuple[Scene, Sequence[View]]:
         try:
             variation(scene, parameter)
         except UsageError as error:
-            names = variable_names(scene)
-            components = [f"{n}.{c}" for n in names for c in component_names(n, value_of(scene, n))]
-            guess = "" if parameter in names else suggestion(parameter, [*names, *components])
-            raise UsageError(f"--gradient {parameter}: {error}{guess}") from None
+            raise UsageError(f"--gradient {parameter}: {error}") from None
     return scene, views
 
 
@@ -250,7 +243,7 @@ def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) ->
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
     exposed = [image / white for image in images]
-    MOVIES[path.suffix.lower()](path, [srgb.encode_bytes(image) for image in exposed], fps)
+    MOVIES[path.suffix.lower()](path, [encode_bytes(image) for image in exposed], fps)
     for view, image in zip(views, exposed, strict=True):
         write_preview(folder / f"{view.name}.png", image)
     return white

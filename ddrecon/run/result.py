@@ -89,44 +89,44 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
 
     A field is `{file: ...}`, a map the name of its file, a camera `{matrix: ...}`.
     """
-    views = {f"views.{view['name']}": view for view in described["views"]}
-    media = {"": described["volume"]} | {
-        f"media.{name}.": section for name, section in described["volume"].get("media", {}).items()
-    }
+    views = {view["name"]: view for view in described["views"]}
     for name, value in values.items():
         owner, _, key = name.rpartition(".")
-        if owner in views:
-            _put_view(views[owner], key, value)
-        elif name.startswith("lights."):
-            light = described["lights"][int(owner.removeprefix("lights."))]
-            light["file" if isinstance(value, str) else key] = value
-        elif name == "ground.albedo":
-            described["ground"]["albedo"] = {"file": value} if isinstance(value, str) else value
+        place, _, rest = owner.partition(".")
+        if place == "views":
+            _put_view(views[rest], key, value)
+        elif place == "lights":
+            described["lights"][int(rest)]["file" if isinstance(value, str) else key] = value
+        elif place == "ground":
+            described["ground"][key] = {"file": value} if isinstance(value, str) else value
         else:
             medium, key = split_name(name)
-            section = media[medium]
-            for pair in PAIRS:  # one of them replaces the other
-                if key in (*PAIRS[0], *PAIRS[1]) and key not in pair:
-                    for other in pair:
-                        section.pop(other, None)
-            is_angular = key == "g" or key.startswith(PHASE)
-            section = section.get("phase", section) if is_angular else section
-            section[key.removeprefix(PHASE)] = value
+            section = described["volume"]
+            if medium:
+                section = section["media"][medium.split(".")[1]]
+            _put_medium(section, key, value)
 
 
 def _put_view(section: dict[str, Any], key: str, value: Any) -> None:
     camera = section["camera"]
-    if key in RESPONSE:
-        section[key] = value
-    elif key == "camera":
+    if key == "camera":
         for other in ("origin", "target", "up"):
             camera.pop(other, None)
         camera |= value
     elif key == "focal":
         camera["fov"] = 2 * math.degrees(math.atan(0.5 / value))
-    elif key == "principal_point":
-        camera["principal_point"] = value
     elif key == "distortion":
-        model = camera["distortion"]["type"]
-        coefficients = zip(LENSES[model], value, strict=True)
-        camera["distortion"] = {"type": model} | dict(coefficients)
+        names = LENSES[camera["distortion"]["type"]]
+        camera["distortion"] |= dict(zip(names, value, strict=True))
+    else:
+        (section if key in RESPONSE else camera)[key] = value
+
+
+def _put_medium(section: dict[str, Any], key: str, value: Any) -> None:
+    pairs = {name: pair for pair in PAIRS for name in pair}
+    if key in pairs:  # which replaces the other pair
+        for other in pairs.keys() - pairs[key]:
+            section.pop(other, None)
+    if key == "g" or key.startswith(PHASE):
+        section = section.get("phase", section)
+    section[key.removeprefix(PHASE)] = value

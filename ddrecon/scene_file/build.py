@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import choose_diffusion, count_colors
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather, suggestion
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -31,7 +31,7 @@ from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume, mix_media
 from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene, View, require_above, require_supported
 from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
@@ -45,14 +45,12 @@ from ddrecon.scene_file.schema import (
     PointSection,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
-from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
     component_names,
     find_volume_readers,
     name_each,
     value_of,
-    variable_names,
 )
 
 LIGHTS: dict[type, Callable[..., Light]] = {
@@ -272,9 +270,8 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     key, cells = f"optimize.parameters.{name}", scene.volume.grid.shape
     try:
         value = value_of(scene, name).clone()
-    except UsageError:
-        fault = f"the scene has no such number{suggestion(name, variable_names(scene))}"
-        raise scene_file.refused(key, fault) from None
+    except UsageError as error:
+        raise scene_file.refused(key, str(error)) from None
     kind, init, is_field = kind_of(name), settings.init, settings.field
     if name == "emission" and _is_dark(value):
         # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.

@@ -18,20 +18,21 @@ from ddrecon.cameras import (
     CELL,
     Camera,
     cast_rays,
+    distort,
     edge_places,
     image_places,
     look_at,
     pixel_width,
     project,
+    ray_through,
 )
 from ddrecon.errors import DataWarning, FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.hull import HullError, bound_smoke, find_shown
 from ddrecon.io.images.films import FILMS, frame_times, nearest_frame
 from ddrecon.io.images.table import Image, read_image, read_mask
-from ddrecon.lenses import distort, ray_through
-from ddrecon.march.box import cross_box
-from ddrecon.pictures.noise import Noise
+from ddrecon.march.samplers import cross_box
+from ddrecon.pictures import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
 from ddrecon.scene_file.schema import Bounds, SceneTree

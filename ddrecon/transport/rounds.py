@@ -20,8 +20,7 @@ from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
 from ddrecon.diffusion.operator import Operator
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Cut, add, cut, join, mean_and_first
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics

@@ -15,8 +15,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill, join
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import NEARLY, apply_around

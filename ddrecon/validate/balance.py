@@ -25,17 +25,15 @@ from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import add, cut, fill, weigh
 from ddrecon.light.pairs import ReversedBeam
+from ddrecon.light.profile import enter_faces
 from ddrecon.light.reduced import ambient_radiance
-from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.light_field import fluence_of, multiply_scatters
 from ddrecon.lighting import solve_light
 from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
-from ddrecon.medium.coefficients import Medium, keep_medium
-from ddrecon.medium.levels import refine_medium
+from ddrecon.medium.coefficients import Medium, keep_medium, refine_medium, remaining_moments
 from ddrecon.medium.optics import reflectance, transmitted_moments
-from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings

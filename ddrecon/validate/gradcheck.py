@@ -10,7 +10,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -48,72 +48,34 @@ Values = Mapping[str, Tensor]
 Loss = Callable[[Values], Tensor]
 
 
-@dataclass(frozen=True)
-class EntryCheck:
-    """The derivative by one entry of a parameter, or along a random direction in it.
-
-    `adjoint`: by reverse mode; `difference`: by central differences with the `step` that agrees
-    best (larger ones suffer from truncation, smaller ones from rounding); `error`: their relative
-    difference.
-    """
-
-    entry: str
-    value: float | None
-    adjoint: float
-    difference: float
-    step: float
-    error: float
+COLUMNS = {"parameter": "", "verdict": "", "tangent_to_adjoint": ".1e", "differences": ".1e"}
+COLUMNS |= {"entry": "", "step": ".1e", "adjoint": ".7e"}
+ALLOWED = f"allowed: tangent to adjoint {AGREE_MODES:.0e}, differences {AGREE_DIFFERENCES:.0e}"
 
 
-@dataclass(frozen=True)
-class GradientCheck:
-    """The check of one parameter, or of all at once.
-
-    `tangent` is the derivative by forward mode along the random direction that is the first of
-    `entries`, and `modes_error` its relative difference from the adjoint's.
-    """
-
-    parameter: str
-    tangent: float
-    modes_error: float
-    entries: tuple[EntryCheck, ...]
-
-    @property
-    def has_passed(self) -> bool:
-        """Whether both errors are within bounds (a NaN is not)."""
-        return self.modes_error <= AGREE_MODES and all(
-            entry.error <= AGREE_DIFFERENCES for entry in self.entries
-        )
-
-
-def table(checks: Sequence[GradientCheck]) -> list[str]:
-    """The checks as a table in Markdown, each with its worst entry; errors are relative."""
-    modes = f"tangent - adjoint (allowed {AGREE_MODES:.0e})"
-    differences = f"differences - adjoint (allowed {AGREE_DIFFERENCES:.0e})"
-    head, rows = ("parameter", "verdict", modes, differences, "at worst", "step", "derivative"), []
-    for check in checks:
-        worst = max(check.entries, key=lambda entry: entry.error)
-        row = [check.parameter, "pass" if check.has_passed else "FAIL", f"{check.modes_error:.1e}"]
-        row += [f"{worst.error:.1e}", worst.entry, f"{worst.step:.1e}", f"{worst.adjoint:.7e}"]
-        rows.append(row)
-    return table_lines(head, rows)
-
-
-def describe(checks: list[GradientCheck]) -> dict[str, Any]:
-    """The checks as plain values, for a JSON file."""
-    return {
-        "passed": all(check.has_passed for check in checks),
-        "checks": [asdict(check) | {"passed": check.has_passed} for check in checks],
-    }
+def lines(report: Mapping[str, Any]) -> list[str]:
+    """The report of `check_parameters` as a table, with the worst entry of each check."""
+    rows = list[dict[str, Any]]()
+    for check in report["checks"]:
+        worst = max(check["entries"], key=lambda entry: entry["error"])
+        row = check | worst | {"verdict": "pass" if check["passed"] else "FAIL"}
+        errors = {"tangent_to_adjoint": check["modes_error"], "differences": worst["error"]}
+        rows.append(row | errors)
+    return [*table_lines(COLUMNS, rows), f"errors are relative; {ALLOWED}"]
 
 
 def check_parameters(
     scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Progress
-) -> list[GradientCheck]:
-    """The checks of the parameters `names` of `scene` (float64), and of all of them at once.
+) -> dict[str, Any]:
+    """The `checks` of the parameters `names` of `scene` (float64), and of all of them at once.
 
-    Without names it is what the scene optimizes, or density where that is nothing. `samples`
-    entries of each are looked at one by one. Raises UsageError for a name the scene does not have.
+    Without names it is what the scene optimizes, or density where that is nothing. Of each there is
+    the `tangent`, the derivative by forward mode along a random direction, and `modes_error`, its
+    relative difference from the adjoint's. `entries` are that direction and so many `samples` of
+    the parameter's: the `adjoint`, the derivative by reverse mode, and the central `difference`
+    with the `step` that agrees best, whose relative difference is `error`. A check has `passed`
+    where both errors are within bounds, and the report where all have. Raises UsageError for a name
+    the scene does not have.
     """
     known = variable_names(scene)
     if unknown := [name for name in names if name not in known]:
@@ -133,7 +95,7 @@ def check_parameters(
     ]
     if len(names) > 1:
         checks.append(_check(TOGETHER, loss, values, 0, generator))
-    return checks
+    return {"passed": all(check["passed"] for check in checks), "checks": checks}
 
 
 def _check(
@@ -142,10 +104,8 @@ def _check(
     parameters: Mapping[str, tuple[Tensor, Tensor]],
     samples: int,
     generator: torch.Generator,
-) -> GradientCheck:
-    """The check of `parameters`, values with their gradients, along a random direction, and by
-    `samples` entries of each.
-    """
+) -> dict[str, Any]:
+    """The check, called `label`, of `parameters`, values with their gradients."""
     steps, direction, adjoint = dict[str, list[float]](), dict[str, Tensor](), 0.0
     for name, (value, bar) in parameters.items():
         size = float(value.abs().max()) or 1.0
@@ -161,16 +121,17 @@ def _check(
 
     first = next(iter(steps.values()))
     shares = [step / first[0] for step in first]
-    compared = _compare(functools.partial(at, direction), adjoint, shares, 0.0)
-    entries = [EntryCheck("a random direction", None, adjoint, *compared)]
+    along = {"entry": "a random direction", "value": None}
+    entries = [along | _compare(functools.partial(at, direction), adjoint, shares, 0.0)]
     for name, (value, bar) in parameters.items() if samples else ():
         floor = NEGLIGIBLE * float(bar.abs().max())
         for index in pick_entries(name, value, samples, generator):
             unit = torch.zeros_like(value)
             unit.view(-1)[index] = 1
             slope, number = float(bar.flatten()[index]), float(value.flatten()[index])
+            entry = {"entry": entry_name(name, value, index), "value": number}
             compared = _compare(functools.partial(at, {name: unit}), slope, steps[name], floor)
-            entries.append(EntryCheck(entry_name(name, value, index), number, slope, *compared))
+            entries.append(entry | compared)
     with forward_ad.dual_level():
         duals = {
             name: forward_ad.make_dual(parameters[name][0], change)
@@ -179,13 +140,15 @@ def _check(
         derivative = forward_ad.unpack_dual(loss(duals)).tangent
     tangent = 0.0 if derivative is None else float(derivative)
     error = abs(tangent - adjoint) / max(abs(adjoint), TINY)
-    return GradientCheck(label, tangent, error, tuple(entries))
+    has_passed = error <= AGREE_MODES and all(e["error"] <= AGREE_DIFFERENCES for e in entries)
+    check = {"parameter": label, "tangent": tangent, "modes_error": error}
+    return check | {"entries": entries, "passed": has_passed}
 
 
 def _compare(
     at: Callable[[float], float], adjoint: float, steps: Sequence[float], floor: float
-) -> tuple[float, float, float]:
-    """The central difference of `at` that agrees best, its step and its relative error.
+) -> dict[str, Any]:
+    """The central `difference` of `at` that agrees best, its `step` and its relative `error`.
 
     It is of fourth order: f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h. Each of the 18 values
     that this adds, counted by weight, may be off by one unit in the last place. Where none of
@@ -209,7 +172,7 @@ def _compare(
             error = abs(difference - adjoint) / scale
         tried.append((error if math.isfinite(error) else math.inf, step, difference))
     error, step, difference = min(tried)
-    return difference, step, error
+    return {"adjoint": adjoint, "difference": difference, "step": step, "error": error}
 
 
 def starting_point(

@@ -147,12 +147,13 @@ CASES: dict[str, HardCase] = {
         eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False
     ),
 }
-HEAD: tuple[str, ...] = ("iterations", "residual", "attainable", "image_error", "gradient_error")
-HEAD += ("lowest", "energy", "energy_double", "depth")
+NUMBERS: tuple[str, ...] = ("iterations", "residual", "attainable", "image_error", "gradient_error")
+NUMBERS += ("lowest", "energy", "energy_double", "depth")
 """The numbers of a case; the first, up to `energy`, are of float32.
 
 Errors are relative RMS, absolute where nothing is; `lowest` is a part of the brightest pixel.
 """
+COLUMNS = {"case": "", **dict.fromkeys(NUMBERS, ".2g"), "verdict": ""}
 SINGLE_FROM_DOUBLE = 1e-4
 """Errors of images, and of gradients, in float32 against float64."""
 OPAQUE = 400.0
@@ -164,7 +165,7 @@ ROUNDINGS = 8
 
 
 def find_failures(numbers: Mapping[str, float]) -> list[str]:
-    """The bounds that `numbers`, by the names of `HEAD`, do not keep; a NaN keeps none."""
+    """The bounds that `numbers`, by the names of `NUMBERS`, do not keep; a NaN keeps none."""
     single = SINGLE_FROM_DOUBLE * max(1, numbers["depth"] / OPAQUE)
     most = TOLERANCE[torch.float32] + ROUNDINGS * numbers["attainable"]
     bounds = {
@@ -193,34 +194,26 @@ def run_case(case: HardCase, device: torch.device) -> dict[str, Any]:
         )
     except SolveError as error:
         return {"failures": [str(error)]}
-    errors = relative_error(image, exact), relative_error(gradient, exact_gradient)
-    lowest = float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny))
-    residual, attainable, energy = balance
-    depth = case.depth * max(case.shape)
-    measured = (
-        iterations,
-        residual,
-        attainable,
-        *errors,
-        lowest,
-        energy,
-        exact_balance.energy,
-        depth,
-    )
-    numbers = dict(zip(HEAD, measured, strict=True))
-    return numbers | {"failures": find_failures(numbers)}
+    numbers: dict[str, float] = {
+        **balance._asdict(),
+        "iterations": iterations,
+        "image_error": relative_error(image, exact),
+        "gradient_error": relative_error(gradient, exact_gradient),
+        "lowest": float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
+        "energy_double": exact_balance.energy,
+        "depth": case.depth * max(case.shape),
+    }
+    return {**numbers, "failures": find_failures(numbers)}
 
 
 def hard_lines(report: Mapping[str, Any]) -> list[str]:
     """The report of `run_cases` as a table, and how many cases failed."""
-    rows = list[list[str]]()
+    rows = list[dict[str, Any]]()
     for name, case in report["cases"].items():
-        numbers = [f"{case[key]:.2g}" if key in case else "" for key in HEAD]
         failures = ", ".join(case["failures"])
-        rows.append([name, *numbers, f"FAIL: {failures}" if failures else "pass"])
-    failed = sum(bool(case["failures"]) for case in report["cases"].values())
-    head = ["case", *(name.replace("_", " ") for name in HEAD), "verdict"]
-    return [*table_lines(head, rows), f"{len(rows)} cases, {failed} failed"]
+        rows.append(case | {"case": name, "verdict": f"FAIL: {failures}" if failures else "pass"})
+    failed = sum(bool(row["failures"]) for row in rows)
+    return [*table_lines(COLUMNS, rows), f"{len(rows)} cases, {failed} failed"]
 
 
 class Balance(NamedTuple):

@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, read out of a scene and put back into it.
+"""The numbers of a scene by name: read out of it, put back into it, and whether they are legal.
 
 `density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g`, `phase.*` and, where it glows,
 `emission` are the volume's; `lights.0.irradiance` is any number of the first light;
@@ -8,10 +8,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
+from itertools import chain
 from typing import Any, TypeVar
 
 import torch
@@ -19,17 +21,20 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import twist
-from ddrecon.errors import UsageError
+from ddrecon.errors import UsageError, nearest
 from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume, remix
 from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.records import faults_of
 from ddrecon.scene import Scene, View
+from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
     RESPONSE,
+    STEEPEST_G,
     XYZ,
     is_of_volume,
     kind_of,
@@ -38,6 +43,9 @@ from ddrecon.variables.kinds import (
 
 EVERY = "views.*."
 """How names for all training views at once begin: `views.*.exposure`."""
+RIGID = 0.01
+"""How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
+KEYS = tuple(key.name for key in fields(Scene) if key.name != "views")
 Settings = TypeVar("Settings")
 
 
@@ -212,14 +220,15 @@ def is_real(value: object) -> bool:
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
-    names = [known for known in variable_names(scene) if not known.startswith("views.")]
-    hints = [f"besides views, the scene has {', '.join(names)}"]
-    if scene.views:
-        view = scene.views[0]
-        hints.append(f"each view has {', '.join(_view_keys(view))}, as in views.{view.name}.camera")
+    names = variable_names(scene)
+    components = [f"{n}.{c}" for n in names for c in component_names(n, value_of(scene, n))]
+    if near := nearest(name, [*names, *components]):
+        return UsageError(f"no variable {name!r}{near}")
+    names = [known for known in names if not known.startswith("views.")]
+    hint = f"besides views, the scene has {', '.join(names)}"
     if name == "emission":
-        hints = ["a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"]
-    return UsageError(f"no variable {name!r}; {'; '.join(hints)}")
+        hint = "a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"
+    return UsageError(f"no variable {name!r}; {hint}")
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:
@@ -340,7 +349,7 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
             change = torch.zeros_like(value)
             change[components.index(component)] = 1
             return owner, change
-    raise UsageError(f"the scene has no number {name}")
+    raise _unknown(scene, name)
 
 
 @contextmanager
@@ -356,3 +365,99 @@ def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(value_of(scene, variable), change)
         yield with_values(scene, {variable: dual})
+
+
+def require_scene(scene: object) -> None:
+    """Raises UsageError unless `scene` is one."""
+    if not isinstance(scene, Scene):
+        kind = type(scene).__name__
+        raise UsageError(f"expected a Scene, found {kind}; ddrecon.load_scene(path) reads one")
+
+
+def require_legal(scene: Scene, view: str | None = None) -> None:
+    """Raises UsageError where a number of `scene` is none that a scene file may have.
+
+    That is one of its volume, its lights or its views (of the one named `view`, or all) of a wrong
+    type, shape, precision or device, one that is not finite, or out of range, such as a density
+    below 0. Numbers on a GPU are not looked at: that would wait for them.
+    """
+    require_scene(scene)
+    views = scene.views if view is None else [scene.view(view)]
+    faults = faults_of(scene)
+    if view is not None:
+        faults = chain(faults_of(scene, keys=KEYS), faults_of(views[0], f"views.{view}"))
+    for key, fault in faults:
+        raise UsageError(f"{key}: {fault}")
+    cells, density = scene.volume.grid.shape, scene.volume.density
+    if density.is_meta:
+        raise UsageError("density: has no numbers on the device meta")
+    require_shape("volume.support", scene.volume.support, cells)
+    for item in views:
+        _require_view(item)
+    for name, value in _numbers_of(scene, views).items():
+        require_form(name, value, value, density, cells)
+        if value.is_cpu:
+            _require_range(name, value)
+
+
+def _require_range(name: str, value: Tensor) -> None:
+    """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
+    kind = kind_of(name)
+    least, most = (float(end) for end in value.detach().aminmax())
+    range_found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
+    if not math.isfinite(least + most):
+        raise UsageError(f"{name}: must be finite, {range_found}")
+    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
+        # A scene may scatter further forward than a run makes it.
+        raise UsageError(f"{name}: must be above -1 and below 1, {range_found}")
+    if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
+        bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
+        raise UsageError(f"{name}: must be {bounds}, {range_found}")
+    if kind.is_direction and least == most == 0:
+        raise UsageError(f"{name}: must not be zero")
+
+
+def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
+    """All that can be varied of `scene` and its `views`, by name, as it is stored."""
+    numbers: dict[str, object] = {
+        name: read()
+        for name, read in find_readers(scene).items()
+        if not name.startswith("views.") and split_name(name)[1] not in EXTINCTION_AND_ALBEDO
+    }
+    for view in views:
+        camera, owner = view.camera, f"views.{view.name}."
+        numbers |= {owner + key: getattr(view, key) for key in RESPONSE}
+        numbers |= {owner + "camera": camera.pose, owner + "distortion": camera.distortion}
+        numbers[owner + "principal_point"] = camera.principal_point
+    return {name: value for name, value in numbers.items() if isinstance(value, Tensor)}
+
+
+def _require_view(view: View) -> None:
+    """Raises UsageError where what is not varied of `view` cannot be: shapes, its pose and lens."""
+    owner, camera, lens = f"views.{view.name}.", view.camera, view.camera.lens
+    pose, half, size = camera.pose, torch.as_tensor(camera.half_width).detach(), camera.size
+    require_shape(f"{owner}camera.pose", pose, (3, 4))
+    if half.is_cpu and not 0 < float(half) < math.inf:
+        rule = "half_width, 1 / (2 focal), must be above 0 and finite"
+        raise UsageError(f"{owner}camera: {rule}, found {float(half):g}")
+    if pose.is_cpu and not _is_rigid(pose.detach()):
+        rule = "the first three columns of its pose must be of unit length and perpendicular"
+        raise UsageError(f"{owner}camera: {rule}, and not mirror")
+    if (lens is None) != (camera.distortion is None):
+        raise UsageError(f"{owner}camera: give both lens and distortion, or neither")
+    if lens is not None:
+        require_shape(f"{owner}distortion", camera.distortion, (len(LENSES[lens]),))
+    require_shape(f"{owner}image", view.image, (3, *size))
+    require_shape(f"{owner}mask", view.mask, size)
+    shapes = [(colors, *tail) for colors in (1, 3) for tail in ((1, 1), size)]
+    require_shape(f"{owner}background", view.background, *shapes)
+    behind = view.background
+    if behind is not None and behind.is_cpu and not bool(behind.isfinite().all()):
+        raise UsageError(f"{owner}background: must be finite")
+
+
+def _is_rigid(pose: Tensor) -> bool:
+    """Whether `pose` turns and shifts; NaN is for others to tell."""
+    axes = pose[:, :3]
+    off = (axes.T @ axes - torch.eye(3).to(pose)).abs().max()
+    return not (float(off) > RIGID or float(axes.det()) < 0)

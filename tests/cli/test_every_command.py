@@ -57,8 +57,8 @@ AT_ONCE = """
 2 info wrong.yaml
 2 export wrong.yaml -o out.vdb
 2 check scene.yaml --dtype float16
-3 info gone.vdb
-3 export gone.npz -o out.vdb
+2 info gone.vdb
+2 export gone.npz -o out.vdb
 """
 CALLS = [line.split() for line in AT_ONCE.strip().splitlines()]
 PROGRAM = f"""

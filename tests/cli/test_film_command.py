@@ -1,14 +1,10 @@
 """A film from the command line: each frame is a run, and nothing depends on when it was done."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import chdir
-from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +19,8 @@ from small_scene import contents
 import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
-from ddrecon.film.drive import MIXED, share_out, spread_out
+from ddrecon.errors import UsageError
+from ddrecon.film import MIXED, spread_out
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -129,7 +126,7 @@ def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> N
     assert 'data-frames="[0, 1, 2, 3]"' in page and '"name": "side"' in page
     # What is shared is the same in all frames, and known for what it is.
     shared = json.loads((out / "shared.json").read_text())
-    assert shared["frames"] == [0, 3]
+    assert shared["frames"] == [0, 3] and not (out / "checkpoints").exists()
     for number in range(FRAMES):
         parameters = json.loads((out / f"frames/{number:04d}/parameters.json").read_text())
         assert parameters["lights.0.irradiance"] == [shared["values"]["lights.0.irradiance"]]
@@ -233,32 +230,6 @@ def test_killed_anywhere_and_in_parts_to_the_same_bits(
     films = [json.loads(Path(place, "film.json").read_text()) for place in ("parts", whole)]
     psnrs = [[row["psnr"] for row in record["frames"]] for record in films]
     assert psnrs[0] == psnrs[1]
-
-
-@pytest.mark.slow
-def test_ranks_share_out_the_frames_and_calibrate_once(film: Path) -> None:
-    """The second waits, and takes what the first has found; the last to end knows of all."""
-    job = {"ranks": 2, "arguments": optimize("-o", "out", *FEW)}
-    script = Path(__file__).parents[1] / "ranks/forked.py"
-    known = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    run = [sys.executable, str(script), json.dumps([job]), "."]
-    subprocess.run(run, check=True, timeout=200, env=known)
-    assert json.loads(Path("codes.json").read_text()) == [[0, 0]]
-    frames = json.loads(Path("out/film.json").read_text())["frames"]
-    assert [row["frame"] for row in frames] == [*range(FRAMES)]
-    found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 2)]
-    assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
-
-
-def test_ranks_share_out_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    for frames, count in product(range(1, 6), range(1, 8)):
-        monkeypatch.setattr("ddrecon.film.drive.rank_count", lambda count=count: count)
-        shares = []
-        for rank in range(count):
-            monkeypatch.setattr("ddrecon.film.drive.own_rank", lambda rank=rank: rank)
-            shares.append(share_out(range(frames)))
-        assert [*chain(*shares)] == [*range(frames)] and shares[0]
-        assert max(map(len, shares)) == -(-frames // count)
 
 
 def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:
@@ -379,8 +350,10 @@ def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, su
     assert fps == 25 and "velocity [u/s]" in units
 
 
-def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refuse) -> None:
-    """And nothing is touched while another process has that part, or where it is another film."""
+def test_a_part_done_anew_leaves_all_else(
+    film: Path, run: Run, succeed: Run, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing is touched while another process is there, or where it is another film."""
     succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *ALONE))
     before, places = contents(film / "out"), ("frames/0000", "frames/0001")
     written = {
@@ -392,7 +365,16 @@ def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refu
     for place in places:
         Path("out", place, "mine.txt").write_text("mine")
     redo = optimize("-o", "out", "--frames", "1:1", "--overwrite", *ALONE)
-    succeed(*redo, "--export", "npz")
+    advance = Reconstruction.advance
+
+    def advance_locked(run: Reconstruction) -> Any:
+        with pytest.raises(UsageError, match="is writing there"), hold(Path("out", LOCK)):
+            pass
+        return advance(run)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Reconstruction, "advance", advance_locked)
+        succeed(*redo, "--export", "npz")
     after = contents(film / "out")
     first = [name for name in before if name.startswith("frames/0000")]
     assert {name: before[name] for name in first} == {name: after[name] for name in first}
@@ -400,10 +382,14 @@ def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refu
     assert after["frames/0001/loss.csv"] != before["frames/0001/loss.csv"]
     (line,) = refuse(2, *redo, "-D", "volume.albedo=0.5")
     assert line.startswith("out: holds another film; use another output folder: volume.albedo")
-    with hold(Path("out/frames/0001", LOCK)):
-        for how in (redo, optimize("-o", "out", "--overwrite", *ALONE)):
-            (line,) = refuse(2, *how)
-            assert line.startswith("out/frames/0001: process ") and "is writing there" in line
+    for place in ("out", "out/frames/0001"):
+        with hold(Path(place, LOCK)):
+            for how in (redo, optimize("-o", "out", "--overwrite", *ALONE)):
+                (line,) = refuse(2, *how)
+                assert line.startswith(f"{place}: process ") and "is writing there" in line
+    loud = [word for word in optimize("-o", "out", "--resume", "--frames", "1:1") if word != "-q"]
+    assert "stay as they are: 1\n" in run(*loud, "-D", "frames.calibrate=0").stderr
+    assert not [*Path("out").rglob("checkpoints/previous.pt")]
 
 
 def test_frames_are_spread_over_all() -> None:

@@ -19,7 +19,7 @@ from small_scene import contents
 
 from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import LOCK, hold
-from ddrecon.reconstruct import recording, tuning
+from ddrecon.reconstruct import gradients, tuning
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.search import Search
 from ddrecon.run import job, quality
@@ -243,7 +243,7 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
 
 
 MOMENTS = {
-    "after a render at a new resolution": (recording, "differentiate", 3),
+    "after a render at a new resolution": (gradients, "differentiate", 3),
     "after the first step": (Search, "judge", 1),
     "after a later step": (Search, "judge", 3),
 }

@@ -30,7 +30,8 @@ optimize scene.yaml -o . --overwrite => 2 scene.yaml: was changed and would be r
 render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
-render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
+render scene.yaml -o out --gradient densty => 2 --gradient densty: no variable 'densty'; did you m
+render scene.yaml -o out --gradient foo => 2 --gradient foo: no variable 'foo'; besides views, the
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range 2<=x
 render scene.yaml -o out --ring 99999 => 2 Error: Invalid value for '--ring': 99999 is not in the
 render scene.yaml -o out --ring 3 --fps nan => 2 Error: Invalid value for '--fps': 'nan' is not a
@@ -53,6 +54,7 @@ optimize done/result.yaml -o out --iterations 9 => 2 done/result.yaml: a finishe
 optimize film -o out => 2 film: is the folder of a film; name that of a frame, such as film/frames/
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
+optimize scene.yaml -o out --resume --overwrite => 2 Error: --resume goes on with what --overwrite
 optimize scene.yaml -o out --resume => 2 out/checkpoints/last.pt: there is no checkpoint to resume
 optimize scene.yaml -o full --resume => 2 full: holds notes.txt, which ddrecon did not write
 check full => 2 full: holds no result.yaml, as `ddrecon optimize` writes it at its end; name a
@@ -80,10 +82,12 @@ export film -o a.vdb => 2 film: is the folder of a film; name that of a frame, s
 info film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003
 info density.npz -D volume.g=0 => 2 Error: -D changes a scene file; name one
 export density.npz -o a.vdb -D volume.g=0 => 2 Error: -D changes a scene file; name one
+export gone.vol -o a.vdb => 2 gone.vol: cannot be read
+import gone.xml -o a.yaml => 2 gone.xml: cannot be read
 info front.txt => 3 front.txt: unknown image format '.txt'
 info bad.npz => 3 bad.npz: is damaged: File is not a zip file
-info gone.vol => 3 gone.vol: cannot be read
-uncertainty gone -o sure => 2 gone: holds no run
+info gone.vol => 2 gone.vol: cannot be read
+uncertainty gone -o sure => 2 gone: cannot be read
 uncertainty film -o sure => 2 film: is the folder of a film; name that of a frame, such as film/fr
 uncertainty full -o ./full => 2 full: holds no run
 """

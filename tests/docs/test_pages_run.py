@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from ddrecon import bench
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES
 

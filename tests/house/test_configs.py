@@ -12,8 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.picture import render
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reconstruct.setup import Problem, select_views, start_parameters
+from ddrecon.reconstruct.setup import Problem, scene_at_level, select_views, start_parameters
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.kinds import kind_of, unit_of

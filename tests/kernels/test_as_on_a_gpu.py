@@ -10,8 +10,8 @@ from torch.nn.functional import interpolate
 from twins import assert_same, differentiate, images_of, values_of
 
 from ddrecon.engine import use_engine
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import variable_names

@@ -11,8 +11,8 @@ from as_on_a_gpu import as_on_a_gpu
 from graphics_cards import ARCHITECTURES, find_resources
 
 from ddrecon.engine import use_engine
-from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene_file.build import load_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"

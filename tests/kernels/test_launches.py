@@ -13,9 +13,9 @@ from as_on_a_gpu import as_on_a_gpu
 from tape import record
 
 from ddrecon.engine import use_engine
-from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.gradients import Replays
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.recording import Replays
+from ddrecon.reconstruct.setup import scene_at_level
 
 MOST_READS, MOST_WRITES = 20, 4
 MOST_LAUNCHES = {"no round": 660, "a round": 950, "plume.yaml": 1_260}

@@ -23,16 +23,19 @@ from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid, array_order
-from ddrecon.light.environment import (
-    environment_radiance,
-    pixel_moments,
-    refine_map,
-)
 from ddrecon.light.lights import DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.light.reduced import sum_unscattered_sky
-from ddrecon.light.sky import MAX_SUNS, count_suns, decompose_map, fibonacci_sphere
+from ddrecon.light.sky import (
+    MAX_SUNS,
+    count_suns,
+    decompose_map,
+    environment_radiance,
+    fibonacci_sphere,
+    pixel_moments,
+    refine_map,
+)
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.picture import render
 
@@ -52,16 +55,21 @@ def banded(height: int, width: int) -> Tensor:
     return (1 + torch.sin(around)).expand(3, height, width) + uneven(height, width).clamp(max=1)
 
 
+def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
+    """The direction (x, y, z) of a pixel, from -z over +x around."""
+    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
+    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
+
+
 def hot_pixel(
     height: int, width: int, row: int, column: int
 ) -> tuple[EnvironmentLight, DirectionalLight]:
     """A map black but for one pixel, and the parallel light it is, by its solid angle."""
     radiance = torch.zeros(3, height, width, dtype=torch.float64)
     radiance[:, row, column] = torch.tensor([300.0, 200.0, 100.0])
-    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
-    solid_angle = math.sin(down) * math.pi / (height - 1) * 2 * math.pi / width
-    x, y, z = math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
-    sun = DirectionalLight(tensor(-x, -y, -z), radiance[:, row, column] * solid_angle)
+    solid_angle = math.sin(math.pi * row / (height - 1)) * math.pi / (height - 1)
+    power = radiance[:, row, column] * solid_angle * 2 * math.pi / width
+    sun = DirectionalLight(-tensor(*center(row, column, height, width)), power)
     return light_of(radiance), sun
 
 
@@ -203,12 +211,6 @@ def seen(light: EnvironmentLight, *direction: float) -> list[float]:
     """What is seen along one direction (x, y, z), of any length."""
     vector = torch.nn.functional.normalize(light.radiance.new_tensor(direction), dim=0)
     return environment_radiance(light, array_order(vector)[None])[:, 0].tolist()
-
-
-def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
-    """The direction (x, y, z) of a pixel, from -z over +x around."""
-    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
-    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)

@@ -11,14 +11,19 @@ from scenes import VIEWS
 from torch import Tensor
 from twins import Tensors, assert_same, assert_transposes, differentiate, images_of, values_of
 
-from ddrecon.cameras import cast_rays
+from ddrecon.cameras import Rays, cast_rays
 from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.box import intersect_box
 from ddrecon.march.faces import cells_at_faces, extend_fields, receive_at_faces, shine_through
 from ddrecon.march.outgoing import Inflow, OutgoingLight
-from ddrecon.march.samplers import planes_across, support_of_planes
+from ddrecon.march.samplers import (
+    RaySampling,
+    Sampler,
+    intersect_box,
+    planes_across,
+    support_of_planes,
+)
 from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
@@ -81,6 +86,21 @@ def test_masses_are_zero_where_light_enters_and_others_go_on(axis: int | None):
             on_face = layer if axis == face[0] else 0.5 * (layer + last)
             expected = 0 * last if face in lit else 1.5 * last - 0.5 * before
             torch.testing.assert_close(on_face, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("sampling", [RaySampling(None, longest=1.0), RaySampling(0)], ids=str)
+def test_up_to_faces_masses_are_linear(sampling: RaySampling):
+    """From the outermost centers on, where inside they are of third order."""
+    outgoing = emission_of(*random_values(2, 1, *GRID.shape, seed=1))
+    sampler, (z, y, x) = Sampler(outgoing, sampling, 3), GRID.centers(TRAVEL)
+    origin = torch.stack([TRAVEL.new_tensor(GRID.lower[0]), y[0, 2, 0], x[0, 0, 1]])[None]
+    rays, far = Rays(origin, TRAVEL.new_tensor([[1.0, 0, 0]]), None), z[0] - GRID.lower[0]
+    if sampling.axis is not None:
+        far = far.new_full((1, 1), GRID.extent[0])
+    values, distance = sampler.sample(sampler.values, rays, 0 * far[0], far[0])
+    mass, inside = values[:, 2, 0], distance[:, 0] <= float(z[0] - GRID.lower[0]) * (1 + 1e-9)
+    slopes = (mass.diff() / distance[:, 0].diff())[inside[1:]]
+    assert len(slopes) >= 3 and float(slopes.diff().abs().max()) < 1e-9 < float(slopes.abs().min())
 
 
 def test_light_through_a_face_begins_smoothly():

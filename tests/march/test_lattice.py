@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from media import (
-    assert_derivatives,
+    assert_image_derivatives,
     box_grid,
     make_camera,
     make_scene,
@@ -17,10 +17,8 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
-from ddrecon.march.box import cross_box
-from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
-from ddrecon.march.samplers import choose_sampling
-from ddrecon.march.sight import look_through
+from ddrecon.march.samplers import choose_sampling, cross_box
+from ddrecon.march.sight import Lattice, choose_lattice, interpolate, look_through
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -117,13 +115,7 @@ def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
 def test_derivatives_are_those_of_the_interpolated_image(view: str, scene_of):
     """By density and camera, in both modes as by central differences."""
     scene = replace(scene_of(CAMERAS[view]), render=INTERPOLATED)
-
-    def total(values: dict[str, Tensor]) -> Tensor:
-        image = render(with_values(scene, values))
-        return (image * random_values(*image.shape)).sum()
-
-    names = "density", "views.view.camera"
-    assert_derivatives(total, {name: value_of(scene, name) for name in names})
+    assert_image_derivatives(scene, ("density", "views.view.camera"))
 
 
 def test_an_empty_volume_passes_derivatives_to_every_cell(scene_of):

@@ -32,10 +32,9 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import follow_lights
 from ddrecon.lighting import send, solve_light
 from ddrecon.march import integral as march_module
-from ddrecon.march.box import cross_box, intersect_box
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.march.samplers import choose_sampling
+from ddrecon.march.samplers import choose_sampling, cross_box, intersect_box
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase

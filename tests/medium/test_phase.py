@@ -19,6 +19,7 @@ from ddrecon.medium.phase import (
     TwoLobe,
 )
 from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.autodiff import tensors_in
 from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.picture import render
 from ddrecon.scene import Scene
@@ -85,21 +86,22 @@ def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
         torch.testing.assert_close(*tails, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("phase", [*PHASES.values()][:-1], ids=[*PHASES][:-1])
-def test_values_and_moments_have_both_derivatives(phase: PhaseFunction):
-    kind, cosine = phase.kind, tensor(-0.95, 0.2, 0.9).requires_grad_()
-    numbers = [number.clone().requires_grad_() for number in phase.numbers]
+@pytest.mark.parametrize("name", [name for name in PHASES if name not in ("rayleigh", "table")])
+def test_all_that_is_asked_has_both_derivatives(name: str):
+    """Values, moments, and what beams with a peak and without one are seen by."""
+    phase, cosine = PHASES[name], tensor(-0.9, -0.2, 0.4, 0.95).requires_grad_()
+    numbers = [number.clone().requires_grad_() for number in tensors_in(phase)]
+    depth = random_values(3, phase.colors, 4).requires_grad_()
 
-    def found(cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
-        phase = kind(*numbers)
-        return (
-            phase.value(cosine),
-            phase.moments(5),
-            phase.peak_tail(1, 4),
-            phase.peak_tail(3, 4, -1),
-        )
+    def ask(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+        others = iter(numbers)
+        other = phase.map(lambda _: next(others))
+        tails, seen = (other.peak_tail(1, 4), other.peak_tail(3, 4, -1)), SeenPhase(other, 1)
+        at_angles = (seen.at_angles(x, cosine.acos().expand(3, 4)) for x in (depth, None))
+        return other.value(cosine), other.moments(5), *tails, seen.along(depth, cosine), *at_angles
 
-    assert torch.autograd.gradcheck(found, (cosine, *numbers), check_forward_ad=True)
+    inputs, modes = (depth, cosine, *numbers), {"check_forward_ad": True, "fast_mode": True}
+    assert torch.autograd.gradcheck(ask, inputs, **modes)
 
 
 # --- what a forward peak does to a beam ----------------------------------------------------------
@@ -133,17 +135,22 @@ def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(
         assert float(found[moment]) == pytest.approx(expected, rel=1e-7)
 
 
-@each_phase
+@pytest.mark.parametrize(
+    "phase",
+    [*PHASES.values(), *(HenyeyGreenstein(scalar(g)) for g in (0.1, 0.95))],
+    ids=[*PHASES, "0.1", "0.95"],
+)
 @each_degree
-def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(
-    phase: PhaseFunction, degree: int
-):
+def test_along_rays_a_spread_peak_is_nearly_the_same(phase: PhaseFunction, degree: int):
+    """And where nothing lies behind it, it is the exact phase function."""
     cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
+    depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 100)]).double().view(-1, 1, 1)
     seen, exact = SeenPhase(phase, degree), phase.value(cosine)
-    summed = summed_series(seen, tensor(0.0)[None], cosine)
-    torch.testing.assert_close(summed, exact, rtol=1e-6, atol=1e-6)
-    along = seen.along(torch.zeros(1, len(exact), 101, dtype=torch.float64), cosine)
-    torch.testing.assert_close(along[0], exact, rtol=1e-6, atol=1e-6)
+    along = seen.along(depth.expand(-1, len(exact), 101), cosine)
+    summed = torch.stack([summed_series(seen, x.expand(len(exact), 1), cosine) for x in depth])
+    for without in (along[0], summed[0]):
+        torch.testing.assert_close(without, exact, rtol=1e-6, atol=1e-6)
+    assert float(((along - summed).abs() / summed.clamp(min=1)).max()) < 0.007
 
 
 @each_phase
@@ -154,36 +161,6 @@ def test_a_spread_peak_is_finite_and_not_negative_at_any_depth(phase: PhaseFunct
     bars = torch.autograd.grad(found.sum(), (depth, cosine))
     assert (found >= 0).all()
     assert all(bool(each.isfinite().all()) for each in (found, *bars))
-
-
-@pytest.mark.parametrize("g", [0.1, 0.5, 0.85, 0.95])
-@each_degree
-def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
-    """And the same where nothing lies behind it."""
-    cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
-    depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double().view(-1, 1, 1)
-    seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
-    along = seen.along(depth.expand(-1, 1, 41), cosine)[:, 0]
-    exact = summed_series(seen, depth.movedim(1, 0), cosine)[0]
-    torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
-    assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
-
-
-@pytest.mark.parametrize("name", ["forward", "two lobes by color"])
-def test_along_rays_all_derivatives_agree_with_differences(name: str):
-    phase = PHASES[name]
-    kind, numbers = type(phase), [number.clone().requires_grad_() for number in phase.numbers]
-    depth = random_values(3, 3, 4).requires_grad_()
-    cosine = tensor(-0.9, -0.2, 0.4, 0.95).requires_grad_()
-
-    def found(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
-        seen = SeenPhase(kind(*numbers), 1)
-        angles = cosine.acos().expand(3, 4)
-        looked_up = (seen.at_angles(each, angles) for each in (depth, None))
-        return seen.along(depth, cosine), *looked_up
-
-    inputs, modes = (depth, cosine, *numbers), {"check_forward_ad": True, "fast_mode": True}
-    assert torch.autograd.gradcheck(found, inputs, **modes)
 
 
 # --- the scaled medium ---------------------------------------------------------------------------
@@ -200,43 +177,34 @@ def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, de
         assert bool((rest >= -1e-12).all())
 
 
+@pytest.mark.parametrize("varies", [False, True])
 @pytest.mark.parametrize("g", MEAN_COSINES)
-def test_scaling_leaves_the_transport_extinction_alone(g: float):
-    sigma_a, sigma_s = random_values(3, seed=1), random_values(3, seed=2)
-    density = random_values(2, 3, 4)
-    volume = Volume(box_grid((2, 3, 4)), density, sigma_a, sigma_s, scalar(g))
-    exact = (sigma_a + (1 - g) * sigma_s).view(3, 1, 1, 1) * density
-    for medium in (scale_medium(volume), keep_medium(volume)):
-        torch.testing.assert_close(medium.transport_extinction, exact, rtol=1e-14, atol=0)
+def test_scaling_leaves_the_transport_extinction_alone(g: float, varies: bool):
+    """Cross sections may be the same in all cells, or given cell by cell."""
+    grid, density = box_grid((2, 3, 4)), random_values(2, 3, 4)
+    cells = grid.shape if varies else (1, 1, 1)
+    sigmas = random_values(3, *cells, seed=1), random_values(3, *cells, seed=2)
+    volume = Volume(grid, density, *(s if varies else s.flatten() for s in sigmas), scalar(g))
+    absorbed, scattered = (sigma * density for sigma in sigmas)
+    exact = absorbed + (1 - g) * scattered
+    for medium, f in ((scale_medium(volume), max(g, 0) ** 2), (keep_medium(volume), 0.0)):
+        remaining = (1 - f) * scattered
+        for coefficient, known in (
+            (medium.absorption.value, absorbed),
+            (medium.scattering.value, scattered),
+            (medium.remaining_scattering, remaining),
+            (medium.extinction.value, absorbed + remaining),
+            (medium.transport_extinction, exact),
+        ):
+            torch.testing.assert_close(coefficient, known, rtol=1e-14, atol=1e-16)
         of_rest = (medium.g - medium.forward_fraction) / (1 - medium.forward_fraction)
         by_parts = medium.absorption.value + (1 - of_rest) * medium.remaining_scattering
         torch.testing.assert_close(by_parts, exact, rtol=1e-13, atol=0)
-        both = medium.absorption.value + medium.remaining_scattering
-        torch.testing.assert_close(medium.extinction.value, both, rtol=1e-14, atol=0)
-    removed = keep_medium(volume).extinction.value - scale_medium(volume).extinction.value
-    expected = max(g, 0) ** 2 * sigma_s.view(3, 1, 1, 1) * density
-    torch.testing.assert_close(removed, expected, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("medium_of", [scale_medium, keep_medium])
-def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of):
-    sigma_a = random_values(3, seed=1)
-    sigma_s = random_values(3, seed=2)
-    density = random_values(2, 3, 4)
-    grid = box_grid((2, 3, 4))
-    fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]
-    constant, varying = (
-        medium_of(Volume(grid, density, *sigmas, scalar(0.3)))
-        for sigmas in ((sigma_a, sigma_s), fields)
-    )
-    for name in ("extinction", "scattering", "absorption"):
-        one, other = (getattr(medium, name).value for medium in (constant, varying))
-        torch.testing.assert_close(one, other, rtol=1e-15, atol=0)
-
-
-SHAPE = (5, 4, 6)
 # --- numbers that differ from cell to cell ---
 
+SHAPE = (5, 4, 6)
 LOBES = torch.tensor([0.8, -0.4], dtype=torch.float64)
 HAZE = HenyeyGreenstein(torch.tensor([0.7, 0.6, -0.5], dtype=torch.float64))
 AIR = Rayleigh(LOBES[0])
@@ -270,7 +238,7 @@ def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
 )
 def test_the_same_in_every_cell_is_one_number(phase: PhaseFunction, is_looked_up: bool, rounds):
     """To rounding, or as closely as functions are looked up by their number."""
-    number = phase.numbers[-1]
+    number = [*tensors_in(phase)][-1]
     cells = phase.with_cells(number.view(*number.shape, 1, 1, 1).expand(*number.shape, *SHAPE))
     # along an axis: on their way across the grid pairs of cells are interpolated otherwise
     changes = {"transport_rounds": rounds, "travel": (0.0, -1.0, 0.0)}
@@ -280,39 +248,30 @@ def test_the_same_in_every_cell_is_one_number(phase: PhaseFunction, is_looked_up
     torch.testing.assert_close(other, one, rtol=tolerance, atol=0)
 
 
-def differences(phase: PhaseFunction, degree: int) -> tuple[Tensor, Tensor]:
-    """How far S of a number at nodes is off that of `phase` itself, [N, R], over 1 or S; and p."""
+BETWEEN = [
+    *((HenyeyGreenstein(scalar(g)), d, 0.01) for g in (0.013, 0.333, 0.777, 0.949) for d in (1, 3)),
+    # Exact at both ends, and nearly where one lobe alone has a peak.
+    *((TwoLobe(LOBES, scalar(weight)), 3, 1e-3) for weight in (0.03, 0.41)),
+    *((TwoLobe(tensor(0.85, 0.6), scalar(weight)), 3, 0.02) for weight in (0.03, 0.41)),
+    *((TwoLobe(lobes, scalar(w)), 3, 1e-10) for lobes in (LOBES, LOBES.abs()) for w in (0.0, 1.0)),
+    # At any weight, since the peaks of both spread light together.
+    (TwoLobe(tensor(0.8, 0.8), scalar(0.3)), 3, 1e-12),
+]
+
+
+@pytest.mark.parametrize(("phase", "degree", "close"), BETWEEN)
+def test_between_the_numbers_of_its_table_s_is_that_of_the_number(
+    phase: PhaseFunction, degree: int, close: float
+):
+    """Of one at nodes, beside that of `phase` itself; and p, where there is no peak."""
     depth, cosine = 4 * random_values(7, 1, 9), 2 * random_values(9, seed=1) - 1
-    number = phase.numbers[-1]
+    number = [*tensors_in(phase)][-1]
     cells = SeenPhase(phase.with_cells(number.expand(1, 1, 1)), degree, number.expand(7, 1, 9))
-    found, expected = (
-        torch.stack([seen.along(depth, cosine), seen.along(0 * depth, cosine)])
-        for seen in (cells, SeenPhase(phase, degree))
-    )
-    return ((found - expected).abs() / expected.clamp(min=1)).unbind()
-
-
-@pytest.mark.parametrize("degree", [1, 3])
-@pytest.mark.parametrize("g", [0.013, 0.333, 0.777, 0.949])
-def test_between_the_numbers_of_its_table_s_is_that_of_g(g: float, degree: int):
-    apart, without_peak = differences(HenyeyGreenstein(LOBES.new_tensor(g)), degree)
-    assert float(apart.max()) < 0.01 and float(without_peak.max()) < 1e-5
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.03, 0.41, 1.0])
-@pytest.mark.parametrize("lobes", [LOBES, LOBES.new_tensor([0.85, 0.6])], ids=["two", "forward"])
-def test_of_two_lobes_s_is_that_of_the_weight(lobes: Tensor, weight: float):
-    """Exactly at both ends, and nearly where one lobe alone has a peak."""
-    apart, without_peak = differences(TwoLobe(lobes, LOBES.new_tensor(weight)), 3)
-    is_exact = weight in (0.0, 1.0)
-    assert float(apart.max()) < (1e-10 if is_exact else 1e-3 if lobes[1] < 0 else 0.02)
-    assert float(without_peak.max()) < 1e-6
-
-
-def test_the_same_lobe_twice_is_that_lobe():
-    """At any weight, since the peaks of both spread light together."""
-    apart, _ = differences(TwoLobe(LOBES.new_tensor([0.8, 0.8]), LOBES.new_tensor(0.3)), 3)
-    assert float(apart.max()) < 1e-12
+    for factor, most in ((1, close), (0, 1e-5)):
+        found, expected = (
+            seen.along(factor * depth, cosine) for seen in (cells, SeenPhase(phase, degree))
+        )
+        assert float(((found - expected).abs() / expected.clamp(min=1)).max()) < most
 
 
 @each_field

@@ -24,12 +24,6 @@ def segments() -> list[Tensor]:
     return [weight, begin, end, 0.5 + random_values(3, 1, seed=3)]
 
 
-@pytest.mark.parametrize("depth", [depth for depth in DEPTHS if depth <= 50])
-def test_the_mean_decay_is_the_mean_of_the_exponential(depth: float):
-    found = float(decay_mean(torch.tensor([depth], dtype=torch.float64)))
-    assert found == pytest.approx(mean_by_quadrature(0, depth), rel=1e-13)
-
-
 def test_the_mean_decay_of_an_opaque_step_is_one_over_its_depth():
     depth = torch.tensor([1e4, 1e8], dtype=torch.float64)
     torch.testing.assert_close(decay_mean(depth), 1 / depth, rtol=1e-15, atol=0)

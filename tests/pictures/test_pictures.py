@@ -5,9 +5,19 @@ import math
 import pytest
 import torch
 
-from ddrecon.pictures.noise import LEAST, Noise, estimate_noise
-from ddrecon.pictures.scales import DEVIATION, K1, K2, RADIUS, Stabilized, structural_similarity
-from ddrecon.pictures.srgb import display, display_slope
+from ddrecon.pictures import (
+    DEVIATION,
+    K1,
+    K2,
+    LEAST,
+    RADIUS,
+    Noise,
+    Stabilized,
+    display,
+    display_slope,
+    estimate_noise,
+    structural_similarity,
+)
 
 
 def smooth_picture(size: int = 160) -> torch.Tensor:

@@ -7,10 +7,11 @@ import torch
 
 from ddrecon.cameras import CELL, Camera, cast_rays, cell_width
 from ddrecon.grid import Grid
-from ddrecon.pictures.noise import Noise
+from ddrecon.medium.coefficients import resample
+from ddrecon.pictures import Noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Frame
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.reconstruct.setup import factors, scene_at_level
 
 
 def test_coarsening_keeps_the_mass(ball_scene) -> None:

@@ -8,7 +8,7 @@ import torch
 from media import box_grid, make_scene, random_values
 
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import resample
+from ddrecon.medium.coefficients import resample
 from ddrecon.reconstruct.parameters import Parameter, face_stiffness, total_variation
 from ddrecon.settings import ParameterSettings
 

@@ -14,10 +14,9 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import LOG, use_engine
 from ddrecon.losses import Target
-from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.gradients import Differentiated, Record, Recording, Replays, differentiate
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.reconstruct.recording import Record, Recording, Replays
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of
 

@@ -9,7 +9,7 @@ from media import random_values
 from torch import Tensor
 
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.search import Objective, Search, Space, Values
+from ddrecon.reconstruct.search import Objective, Search, Space
 
 COUNT = 12
 Function = Callable[[Tensor], Tensor]
@@ -36,13 +36,14 @@ def rosenbrock(x: Tensor) -> Tensor:
 def space_of(metric: Tensor, low: float) -> Space:
     """Entries at least `low` in the diagonal `metric`."""
 
-    def free(values: Values, slopes: Values) -> Values:
-        return {n: (~((v <= low) & (slopes[n] > 0))).to(v) for n, v in values.items()}
+    def free(values: Tensor, slope: Tensor) -> Tensor:
+        return (~((values <= low) & (slope > 0))).to(values)
 
     return Space(
-        lambda values: {n: v.clamp(min=low) for n, v in values.items()},
+        lambda values: values.clamp(min=low),
         free,
-        lambda values, free: lambda many: [{"x": one["x"] * free["x"] / metric} for one in many],
+        lambda values, free, vectors: vectors * free / metric,
+        [COUNT],
     )
 
 
@@ -52,15 +53,15 @@ def objective_of(function: Function, x: Tensor, prior: Function | None = None) -
     loss = function(leaf)
     (slope,) = torch.autograd.grad(loss, leaf)
     if prior is None:
-        return Objective(float(loss), 0.0, {"x": slope}, {})
+        return Objective(float(loss), 0.0, slope, torch.zeros_like(x))
     penalty = prior(leaf)
     (bar,) = torch.autograd.grad(penalty, leaf)
-    return Objective(float(loss), float(penalty), {"x": slope}, {"x": bar})
+    return Objective(float(loss), float(penalty), slope, bar)
 
 
 def begin(function: Function, x: Tensor, space: Space, prior: Function | None = None) -> Search:
-    search = Search(space)
-    search.judge({"x": x}, objective_of(function, x, prior))
+    search = Search(space, x)
+    search.judge(objective_of(function, x, prior))
     return search
 
 
@@ -68,9 +69,8 @@ def advance(search: Search, function: Function, count: int) -> Tensor:
     """Where `search` is after `count` candidates, or when no step helps."""
     for _ in range(count):
         if not search.is_stuck:
-            candidate = search.candidate
-            search.judge(candidate, objective_of(function, candidate["x"]))
-    return search.values["x"]
+            search.judge(objective_of(function, search.candidate))
+    return search.values
 
 
 @pytest.mark.parametrize("low", [-10.0, 0.0])
@@ -101,16 +101,16 @@ def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope()
     search = begin(rosenbrock, random_values(COUNT, seed=3), space_of(metric, -10.0))
     advance(search, rosenbrock, 6)
     assert 3 <= len(search.pairs) <= tuning.PAIRS
-    inverse = search.scales["x"] * metric.reciprocal().diag()
+    inverse = search.scales[0] * metric.reciprocal().diag()
     for move, change, _ in search.pairs:
-        s, y = move["x"], change["x"]
+        s, y = move, change
         rest = torch.eye(COUNT).double() - torch.outer(y, s) / (s @ y)
         inverse = rest.T @ inverse @ rest + torch.outer(s, s) / (s @ y)
-    slope = search.objective.gradients["x"]
-    torch.testing.assert_close(search.direction["x"], -inverse @ slope, rtol=1e-9, atol=1e-12)
+    slope = search.objective.gradient
+    torch.testing.assert_close(search.direction, -inverse @ slope, rtol=1e-9, atol=1e-12)
     # The last move is what the last change of the slope asks for.
     move, change, _ = search.pairs[-1]
-    torch.testing.assert_close(inverse @ change["x"], move["x"])
+    torch.testing.assert_close(inverse @ change, move)
     assert search.gains[-1] == pytest.approx(float(slope @ inverse @ slope) / 2 / search.loss)
 
 
@@ -133,14 +133,14 @@ def test_units_of_unknowns_change_nothing() -> None:
 def test_a_candidate_that_is_no_better_shortens_the_step(loss: float) -> None:
     search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), -10.0))
     before, step, values = search.loss, search.step, search.values
-    nothing = {"x": torch.full((COUNT,), torch.nan).double()}
-    assert not search.judge(search.candidate, Objective(loss, 0.0, nothing, {}))
+    nothing = torch.full((COUNT,), torch.nan).double()
+    assert not search.judge(Objective(loss, 0.0, nothing, nothing))
     assert 0.1 * step <= search.step <= 0.5 * step
     assert search.loss == before and search.values is values and not search.pairs
     # Where no step helps it says so, and does not move.
     for _ in range(100):
         if not search.is_stuck:
-            search.judge(search.candidate, Objective(loss, 0.0, nothing, {}))
+            search.judge(Objective(loss, 0.0, nothing, nothing))
     assert search.is_stuck and search.gain == 0.0 and search.values is values
 
 
@@ -153,16 +153,15 @@ def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has() -> None:
     start, space = random_values(COUNT, seed=3), space_of(MATRIX.diagonal(), -10.0)
     search = begin(quadratic, start, space, prior)
     for _ in range(4):
-        candidate = search.candidate
-        search.judge(candidate, objective_of(quadratic, candidate["x"], prior))
+        search.judge(objective_of(quadratic, search.candidate, prior))
     search.reweigh(0.25)
-    slope = search.objective.slopes(0.25)["x"]
-    x = search.values["x"]
+    slope = search.objective.slope(0.25)
+    x = search.values
     torch.testing.assert_close(slope, MATRIX @ (x - TARGET) + 0.5 * x)
     move, of_loss, of_prior = search.pairs[-1]
-    torch.testing.assert_close(of_loss["x"], MATRIX @ move["x"])
-    torch.testing.assert_close(of_prior["x"], 2 * move["x"])
-    assert search.slope == pytest.approx(float(search.direction["x"] @ slope)) and search.slope < 0
+    torch.testing.assert_close(of_loss, MATRIX @ move)
+    torch.testing.assert_close(of_prior, 2 * move)
+    assert search.slope == pytest.approx(float(search.direction @ slope)) and search.slope < 0
 
 
 def test_a_search_goes_on_from_its_state_to_the_same_bits() -> None:
@@ -172,7 +171,7 @@ def test_a_search_goes_on_from_its_state_to_the_same_bits() -> None:
         file = io.BytesIO()
         torch.save(whole.state(), file)
         file.seek(0)
-        resumed = Search(space)
-        resumed.restore(torch.load(file, weights_only=True), whole.values)
+        resumed = Search(space, torch.ones(COUNT).double())
+        resumed.restore(torch.load(file, weights_only=True))
         both = [advance(search, rosenbrock, 1) for search in (whole, resumed)]
         assert torch.equal(*both) and resumed.step == whole.step

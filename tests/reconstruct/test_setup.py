@@ -8,7 +8,7 @@ import torch
 
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures import Noise
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import Problem, choose_loss, targets_of
 from ddrecon.scene import Scene

@@ -14,7 +14,7 @@ from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.hull import find_shown, hull_of
-from ddrecon.pictures import srgb
+from ddrecon.pictures import decode
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support, describe_support, support_text
@@ -163,7 +163,7 @@ def test_auto_takes_no_noise_of_compression_for_smoke(
     thin = 80 + uneven * torch.sin(2 * x) * torch.sin(2 * y)
     bright = torch.where(core, 220, torch.where(cloud, thin, 7.0 * stem))
     encoded = torch.maximum(bright.round(), speckle(block, share)) / 255
-    image = torch.from_numpy(srgb.decode(encoded.numpy())).float().expand(3, -1, -1)
+    image = torch.from_numpy(decode(encoded.numpy())).float().expand(3, -1, -1)
     shown = find_shown(View("", CAMERAS["pinhole"], image, step=1 / 255), "auto")
     assert bool(shown[cloud | stem].all())
     away = torch.nn.functional.max_pool2d((cloud | stem).float()[None], 9, 1, 4)[0] == 0

@@ -8,9 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from media import box_grid, make_camera, random_values
+from media import make_scene as plain_scene
 
-from ddrecon.cameras import twist
-from ddrecon.picture import render
+from ddrecon.cameras import project, twist
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid
+from ddrecon.lighting import solve_light
+from ddrecon.losses import Target
+from ddrecon.picture import render, view_picture
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support
 from ddrecon.run.quality import (
@@ -20,6 +26,8 @@ from ddrecon.run.quality import (
     find_odd,
     find_results,
     find_unfinished,
+    register,
+    shift_between,
 )
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
@@ -87,7 +95,7 @@ def start_empty(scene: Scene) -> None:
 
 
 FAULTS = {"clean": (lambda scene: None, 24), "exposure": (expose, 24), "cameras": (move, 24)}
-FAULTS |= {"overfit": (keep_one, 50), "unfinished": (start_empty, 5)}
+FAULTS |= {"overfit": (keep_one, 50), "unfinished": (start_empty, 5), "empty": (start_empty, 1)}
 
 
 @pytest.mark.parametrize("kind", FAULTS)
@@ -107,6 +115,21 @@ def findings_of(scene: Scene) -> Findings:
 
 AT_REST = 60, 0.0
 """The iterations of a run that has come to rest, and what its loss can still fall by."""
+
+
+@pytest.mark.parametrize(
+    ("gain", "advice"), [(math.inf, "--resume"), (0.0, "directions of lights")]
+)
+def test_why_a_volume_is_empty_is_told(gain: float, advice: str) -> None:
+    """Nothing else is: what is not there is neither overfit nor seen from a wrong side."""
+    scene = make_scene()
+    views = [replace(view, is_test=view.name == "ring_01") for view in scene.views]
+    nothing = with_values(replace(scene, views=views), {"density": 0 * scene.volume.density})
+    (told,) = diagnose(findings_of(nothing), 3, gain)
+    assert told["kind"] == "empty" and advice in told["text"]
+    glowing = replace(scene.volume, density=nothing.volume.density, emission=torch.ones(1, 8, 8, 8))
+    seen = findings_of(replace(nothing, volume=glowing))
+    assert "empty" not in [each["kind"] for each in diagnose(seen, 3, gain)]
 
 
 @pytest.mark.parametrize("rows", [0, 4])
@@ -203,6 +226,48 @@ def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
     texts = " ".join(find_odd(views, images, 0.0).values())
     found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", texts))
     assert found == told
+
+
+@pytest.mark.parametrize("loss", ["l2", "display"])
+def test_a_camera_that_is_off_is_found(loss: str) -> None:
+    camera = make_camera(size=(40, 40), half_width=0.28)
+    density = torch.nn.functional.avg_pool3d(random_values(1, 16, 16, 16), 5, 2)[0]
+    scene = plain_scene(density, camera=camera, sigma_a=(2.0,), sigma_s=(3.0,))
+    change = torch.tensor([0.02, -0.03, 0.01, 0.015, -0.02, 0.02]).double()
+    moved = twist(camera, change, scene.volume.grid.center_xyz)
+    with torch.no_grad():
+        lit = solve_light(scene, SolveMemory())
+        image = 0.8 * view_picture(lit, scene, replace(scene.views[0], camera=moved))
+        view = replace(scene.views[0], image=image, is_test=True)
+        scene = replace(scene, views=[view])
+        target = Target.of(image, None, loss)
+        as_is = target.psnr_of(view_picture(lit, scene, view))
+        found = register(lit, scene, view, target, {})
+    assert found["psnr"] > as_is + 15
+    true = shift_between(camera, moved, scene.volume)
+    assert true > 0.5 and abs(found["shift"] - true) < 0.15 * true
+
+
+def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell() -> None:
+    """Of two puffs, as much as each extinguishes; a box twice as wide around them changes none."""
+    camera = make_camera(size=(40, 40), half_width=0.6)
+    moved = twist(camera, torch.tensor([0.02, -0.03, 0.01, 0.015, -0.02, 0.02]).double(), (0, 0, 0))
+    grid, cells, places = box_grid((6, 4, 8)), [(1, 2, 6), (4, 0, 1)], []
+    density = torch.zeros(grid.shape).double()
+    for cell, value in zip(cells, (0.5, 1.5), strict=True):
+        density[cell] = value
+        steps = zip(grid.lower, grid.spacing, cell, strict=True)
+        places.append([low + (at + 0.5) * step for low, step, at in steps][::-1])
+    seen = [project(each, torch.tensor(places).double())[0] for each in (camera, moved)]
+    one, other = (seen[0] - seen[1]).norm(dim=1).tolist()
+    sides = zip(grid.lower, grid.upper, strict=True)
+    around = Grid(
+        (12, 8, 16), *zip(*((1.5 * a - 0.5 * b, 1.5 * b - 0.5 * a) for a, b in sides), strict=True)
+    )
+    padded = torch.nn.functional.pad(density, (4, 4, 2, 2, 3, 3))
+    for scene in (plain_scene(density, grid=grid), plain_scene(padded, grid=around)):
+        found = shift_between(camera, moved, scene.volume)
+        assert found == pytest.approx((0.5 * one + 1.5 * other) / 2)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import write_field
+from ddrecon.numerics.autodiff import tensors_in
 from ddrecon.picture import render
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import Run
@@ -115,7 +116,7 @@ def test_a_result_has_the_phase_function_that_was_found(
     found = finished(tmp_path, text, parameters, f"phase: {phase}").volume.phase
     again = load_scene(tmp_path / "out" / RESULT).volume.phase
     assert type(again) is type(found)
-    for one, other in zip(again.numbers, found.numbers, strict=True):
+    for one, other in zip(tensors_in(again), tensors_in(found), strict=True):
         torch.testing.assert_close(one, other.detach(), rtol=1e-6, atol=0)
 
 

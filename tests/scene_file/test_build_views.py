@@ -18,7 +18,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.march.box import cross_box
+from ddrecon.march.samplers import cross_box
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.build_views import explain_blindness, require_frames, sees_box

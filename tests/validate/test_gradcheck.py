@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from ddrecon.diffusion import implicit
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.scene_file.build import load_scene
-from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
+from ddrecon.validate.gradcheck import TOGETHER, check_parameters
 from ddrecon.variables.values import variable_names
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
@@ -27,7 +28,7 @@ ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 
 def check(
     name: str, samples: int = 0, overrides: tuple[str, ...] = ONE_ROUND
-) -> list[GradientCheck]:
+) -> list[dict[str, Any]]:
     """Of one view, above a ground for its number alone, under the light whose number it is."""
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
     seen = name.split(".")[1] if name.startswith("views.") else "front"
@@ -40,14 +41,14 @@ def check(
     scene = replace(scene, views=[scene.view(seen)], ground=ground, lights=lights)
     known = variable_names(scene)
     scene.starts = {one: start for one, start in starts.items() if one in known}
-    return check_parameters(scene, (name,), samples, 0, lambda items, _: items)
+    return check_parameters(scene, (name,), samples, 0, lambda items, _: items)["checks"]
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "density"])
 def test_every_parameter_passes(name: str) -> None:
     (result,) = check(name, overrides=() if name == "g" else ONE_ROUND)
-    assert result.has_passed, result
-    assert any(entry.adjoint != 0 for entry in result.entries)
+    assert result["passed"], result
+    assert any(entry["adjoint"] != 0 for entry in result["entries"])
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_every_parameter_passes(name: str) -> None:
 def test_the_other_forms_of_a_parameter_pass(name: str, overrides: tuple[str, ...]) -> None:
     """The other pair of cross sections, and g of each cell."""
     (result,) = check(name, overrides=overrides)
-    assert result.has_passed, result
+    assert result["passed"], result
 
 
 def test_albedo_1_of_thick_cells_passes() -> None:
@@ -69,35 +70,35 @@ def test_albedo_1_of_thick_cells_passes() -> None:
     thick = "volume.sigma_a=0", "volume.sigma_s=1e3", "diffusion.transport_rounds=0"
     plain = "lights=[{type: ambient, radiance: 1}]", "optimize={parameters: {albedo: {}}}"
     (result,) = check("albedo", overrides=(*thick, *plain))
-    assert result.has_passed, result
+    assert result["passed"], result
 
 
 def test_a_single_cell_passes() -> None:
     (result,) = check("density", overrides=(*ONE_ROUND, "volume.resolution=[1, 1, 1]"))
-    assert result.has_passed, result
-    assert result.entries[0].adjoint != 0
+    assert result["passed"], result
+    assert result["entries"][0]["adjoint"] != 0
 
 
 def test_all_at_once_pass() -> None:
     overrides = [*SMALL, "diffusion.transport_rounds=1"]
     scene = load_scene(CONFIG, overrides=overrides, dtype=torch.float64)
     # None of them alone: `test_every_parameter_passes` checks those.
-    (result,) = check_parameters(scene, NAMES, 0, 0, lambda names, _: names[:0])
-    assert result.parameter == TOGETHER
-    assert result.has_passed, result
+    (result,) = check_parameters(scene, NAMES, 0, 0, lambda names, _: names[:0])["checks"]
+    assert result["parameter"] == TOGETHER
+    assert result["passed"], result
 
 
 def test_density_passes_in_empty_cells_as_well() -> None:
     (result,) = check("density", samples=4)
-    assert result.has_passed, result
-    values = [entry.value for entry in result.entries if entry.value is not None]
+    assert result["passed"], result
+    values = [e["value"] for e in result["entries"] if e["value"] is not None]
     assert {value == 0 for value in values} == {True, False}
 
 
 @pytest.mark.parametrize("g", ["0.8", "-0.6"])
 def test_forward_peaks_and_backward_scattering_pass(g: str) -> None:
     (result,) = check("g", overrides=(f"optimize.parameters.g.init={g}",))
-    assert result.has_passed, result
+    assert result["passed"], result
 
 
 def test_rays_and_beams_along_the_axes_of_the_lattice_pass() -> None:
@@ -106,8 +107,8 @@ def test_rays_and_beams_along_the_axes_of_the_lattice_pass() -> None:
     grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
     scene = make_scene(half_empty(*grid.shape), travel=(0.0, -1.0, 0.0), camera=camera, grid=grid)
     names = "views.view.camera", "lights.0.direction"
-    for result in check_parameters(scene, names, 2, 0, lambda items, _: items):
-        assert result.has_passed, result
+    for result in check_parameters(scene, names, 2, 0, lambda items, _: items)["checks"]:
+        assert result["passed"], result
 
 
 def test_an_unknown_parameter_is_refused() -> None:
@@ -126,7 +127,7 @@ def test_a_derivative_one_percent_off_is_caught(monkeypatch: pytest.MonkeyPatch,
     owner, mode, parameter = BROKEN[case]
     right = getattr(owner, mode)
     monkeypatch.setattr(owner, mode, staticmethod(lambda *arguments: _off(right(*arguments))))
-    assert issubclass(owner, Function) and not check(parameter)[0].has_passed
+    assert issubclass(owner, Function) and not check(parameter)[0]["passed"]
 
 
 def _off(result: object) -> object:

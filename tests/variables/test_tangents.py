@@ -46,10 +46,10 @@ def test_a_derivative_image_is_the_central_difference_of_the_image(scene: Scene)
 @pytest.mark.parametrize(
     ("name", "hint"),
     [
-        ("depth", "no number depth"),
+        ("depth", "no variable 'depth'"),
         ("lights.0.direction", "lights.0.direction.x"),
         ("views.view.camera", "rotation_x"),
-        ("sigma_s.x", "no number"),
+        ("sigma_s.x", "no variable"),
     ],
 )
 def test_what_cannot_vary_is_refused_with_what_can(scene: Scene, name: str, hint: str) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from ddrecon.io.files.atomic import (
     is_temporary,
     note_written,
     refusals,
-    remove_temporaries,
     write_bytes,
 )
 
@@ -33,8 +32,6 @@ KINDS = "run", "film", "uncertainty", "render", "reference", "bench"
 RUN, FILM, UNCERTAINTY, RENDER, REFERENCE, BENCH = KINDS
 """The kinds of jobs that write folders."""
 TEXT: dict[str, Any] = {"encoding": "utf-8", "errors": "surrogateescape"}
-PATIENCE = 1.0
-"""Who waits for a lock says so after so many seconds."""
 
 
 class Folder:
@@ -129,7 +126,6 @@ def claim_folder(
     *,
     overwrite: bool = False,
     resume: bool = False,
-    tell: Callable[[str], None] | None = None,
 ) -> Iterator[Folder]:
     """Makes the folder `path` of this `kind`, and keeps other processes out until the block ends.
 
@@ -137,7 +133,7 @@ def claim_folder(
     which nothing was written is gone afterwards. Raises UsageError where `path` is a file or cannot
     be locked, where it is of another kind, where it holds files of others and is not to be
     overwritten, which keeps these, where it holds its own and neither is said, and where another
-    process writes there, which `tell`, if any, is told of: then that is waited for.
+    process writes there.
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: is a file; name a folder for the output")
@@ -148,11 +144,12 @@ def claim_folder(
         raise UsageError(f"{path}: cannot be made: {error.strerror or error}") from error
     key = Path(os.path.abspath(path))
     try:
-        with hold(path / LOCK, tell):
+        with hold(path / LOCK):
             folder = Folder(path, kind)
             folder.require(overwrite, resume)
             for place in (path, *folder.places()):
-                remove_temporaries(place)
+                for file in filter(is_temporary, place.iterdir()):  # of processes that were killed
+                    file.unlink(missing_ok=True)
             with refusals(path):
                 note_written(path, "/")
             claimed[key], is_new = folder.note, kind_of_folder(path) is None
@@ -170,28 +167,23 @@ def claim_folder(
 
 
 @contextmanager
-def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None]:
+def hold(lock: Path) -> Iterator[None]:
     """Keeps other processes from the file `lock` until the block ends.
 
-    Raises UsageError where it cannot be locked, and where another process holds it; with `tell`
-    that is told and waited for.
+    Raises UsageError where it cannot be locked, and where another process holds it.
     """
     # No soft locks: what they leave behind would have to be judged stale or not.
     file_lock = FileLock(lock, fallback_to_soft=False)
     try:
         try:
-            file_lock.acquire(timeout=0 if tell is None else PATIENCE)
+            file_lock.acquire(timeout=0)
         except Timeout:
             holder = ""
             with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
                 holder = lock.read_text()
             process = f"process {holder}" if holder.isdigit() else "another process"
-            busy = f"{lock.parent}: {process} is writing there"
-            if tell is None:
-                advice = "wait for it, or choose another folder"
-                raise UsageError(f"{busy}; {advice}") from None
-            tell(f"{busy}; waiting for it")
-            file_lock.acquire()
+            advice = "wait for it, or choose another folder"
+            raise UsageError(f"{lock.parent}: {process} is writing there; {advice}") from None
     except OSError as error:
         raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
     try:

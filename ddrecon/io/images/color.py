@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.pictures import srgb
+from ddrecon.pictures import encode_bytes
 
 CICP = re.compile(rb"\x00\x00\x00\x04cICP(....)", re.DOTALL)
 CICP_LINEAR, CICP_SRGB = 8, (1, 6, 13, 14, 15)
@@ -99,7 +99,7 @@ def read_profile(profile: bytes) -> Encoding:
     except (OSError, ImageCms.PyCMSError):
         return Encoding("color profile, which is damaged or of other colors", None, False)
     values = np.asarray(shown, int)[0]
-    for is_linear, expected in ((False, colors), (True, srgb.encode_bytes(colors / 255))):
+    for is_linear, expected in ((False, colors), (True, encode_bytes(colors / 255))):
         is_near = (abs(values - expected[: len(values)]) <= NEAR).all(axis=1)
         if is_near[:256].all():
             return Encoding(source, is_linear, bool(is_near[256:].all()))

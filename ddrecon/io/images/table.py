@@ -30,7 +30,7 @@ from ddrecon.io.images.oiio import (
     read_tiff,
     write_exr,
 )
-from ddrecon.pictures import srgb
+from ddrecon.pictures import decode, encode_bytes
 
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
 """How the .png of an image is to be read."""
@@ -179,7 +179,7 @@ def write_animation(path: Path, frames: Sequence[np.ndarray], fps: float) -> Non
 
 def png_of(pixels: np.ndarray) -> bytes:
     """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
-    return encode(srgb.encode_bytes(pixels), ".png")
+    return encode(encode_bytes(pixels), ".png")
 
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
@@ -248,9 +248,7 @@ def _samples_of(picture: Any) -> np.ndarray:
     return np.stack([samples, alpha.astype(samples.dtype)], axis=2)
 
 
-def _decode(
-    stored: np.ndarray, curve: Callable[[np.ndarray], np.ndarray] = srgb.decode
-) -> np.ndarray:
+def _decode(stored: np.ndarray, curve: Callable[[np.ndarray], np.ndarray] = decode) -> np.ndarray:
     """Linear values of `stored` [h, w] or [h, w, c], multiplied by alpha: the last of 2 or 4 c."""
     values = stored / np.iinfo(stored.dtype).max
     if values.ndim == 2 or values.shape[2] == 3:

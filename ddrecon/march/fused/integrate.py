@@ -20,7 +20,6 @@ from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.sums import Sums, type_of_sums
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.light.beam import Beam
-from ddrecon.march.box import Crossing
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
     Case,
@@ -30,7 +29,7 @@ from ddrecon.march.fused.kernels import (
     tangent_kernel,
 )
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.march.samplers import Sampler
+from ddrecon.march.samplers import Crossing, Sampler
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.layout import across
 from ddrecon.numerics.remember import remember

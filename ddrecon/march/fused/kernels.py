@@ -66,7 +66,7 @@ class Layout(NamedTuple):
             counts.get("remaining", 0),
             len(seen.table(has_peak)) if outgoing.beams else 1,
             count_powers(seen.phase, has_peak),
-            seen.phase.cells is not None and is_scaled(seen.phase.kind),
+            seen.phase.cells is not None and is_scaled(seen.phase),
             tuple(isinstance(beam, PointBeam) for beam in outgoing.beams),
             torch.finfo(outgoing.diffuse.dtype).bits,
         )

@@ -3,7 +3,8 @@
 By rows, on a processor, a launch does some planes of a chunk of ordinates, with each team once
 along z and once against it. They meet in the middle, where each goes on in the next launch: so no
 two write to the same cells at once. By cells, on a GPU and where light enters by faces, a launch
-does one slice of all ordinates of a chunk; products of matrices sum over moments and over these.
+does one slice of all ordinates of a chunk, and products of matrices sum over moments and
+ordinates.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, names_of
-from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 

@@ -14,7 +14,7 @@ from refusals import image_refusal
 
 from ddrecon.errors import DataWarning
 from ddrecon.io.images.table import Image, read_image
-from ddrecon.pictures import srgb
+from ddrecon.pictures import decode
 
 
 def iccp(profile: bytes) -> bytes:
@@ -80,7 +80,7 @@ def test_the_curve_that_a_png_names_is_the_one_that_decodes_it(
     samples = np.random.default_rng(kind).integers(0, 2**depth, (3, 4, COLORS[kind]))
     image = read_silently(write_png(tmp_path / "a.png", samples, depth, kind, **chunks))
     values, colors = samples / (2**depth - 1), 1 if kind in (0, 4) else 3
-    linear = values[..., :colors] if isinstance(said, tuple) else srgb.decode(values[..., :colors])
+    linear = values[..., :colors] if isinstance(said, tuple) else decode(values[..., :colors])
     alpha = values[..., colors:] if kind > 2 else np.ones(1)
     assert np.allclose(image.pixels, np.broadcast_to(linear * alpha, (3, 4, 3)), atol=1e-6)
     assert image.step == (0 if isinstance(said, tuple) else 1 / (2**depth - 1))
@@ -102,7 +102,7 @@ def test_a_profile_counts_in_every_format(tmp_path: Path, suffix: str) -> None:
     stored.save(other, icc_profile=icc_profile(1.8))
     stored.save(wide, icc_profile=icc_profile(has_swapped_primaries=True))
     expected = read_silently(plain).pixels
-    assert np.allclose(expected, srgb.decode(np.array(200 / 255)), atol=0.01)
+    assert np.allclose(expected, decode(np.array(200 / 255)), atol=0.01)
     assert "color profile" in image_refusal(other)
     with pytest.warns(DataWarning, match="primaries other than sRGB's"):
         assert np.array_equal(read_image(wide).pixels, expected)
@@ -113,7 +113,7 @@ def test_other_primaries_are_said_and_colors_taken(tmp_path: Path, said: dict[st
     samples = np.full((2, 2, 3), (200, 100, 50))
     with pytest.warns(DataWarning, match=r"\*\.png: .*primaries other than sRGB's"):
         image = read_image(write_png(tmp_path / "a.png", samples, **said))
-    assert np.allclose(image.pixels, srgb.decode(samples / 255), atol=1e-6)
+    assert np.allclose(image.pixels, decode(samples / 255), atol=1e-6)
 
 
 def test_chromaticities_of_exr_are_said(tmp_path: Path) -> None:
@@ -163,6 +163,6 @@ def test_films_of_other_curves_are_refused(tmp_path: Path, curve: str, is_legal:
     frames = np.full((2, 16, 16, 3), 128, np.uint8)
     iio.imwrite(tmp_path / "a.mp4", frames, **form, output_params=tags)
     if is_legal:
-        assert np.allclose(read_image(tmp_path / "a.mp4").pixels, srgb.decode(0.5), atol=0.01)
+        assert np.allclose(read_image(tmp_path / "a.mp4").pixels, decode(0.5), atol=0.01)
     else:
         assert f"is encoded by {curve}" in image_refusal(tmp_path / "a.mp4")

@@ -265,7 +265,7 @@ def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"read, not written: take \.npz"):
         write_field(path, "density", VALUES, BOUNDS)
     told = refusal(written(path, VALUES, "z y x", **plain()))
-    assert told == "has no field 'density'; it has 'QN'; say name: QN beside file"
+    assert told == "has no field 'density'; it has 'QN'; say name: QN beside its path"
     stretched, twice = plain() | {"z": ([6.5, 7.5, 9.0], {})}, np.stack([VALUES] * 2)
     holes = np.ma.masked_less(VALUES, VALUES.max())
     for values, dimensions, axes, told in (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ddrecon.errors import Problems, SceneError
 from ddrecon.scene_file.load import MAX_BYTES, read_scene
-from ddrecon.scene_file.nodes import parse, resolve
+from ddrecon.scene_file.read import parse, resolve
 
 Refusal = Callable[..., list[str]]
 

@@ -11,11 +11,14 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
+from shutil import rmtree
+from statistics import mean
 from tempfile import TemporaryDirectory
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -34,13 +37,17 @@ from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import note_written, write_json
 from ddrecon.io.files.folders import FILM, RUN, Folder, claim_folder
 from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
+from ddrecon.pictures import encode_bytes
 from ddrecon.progress import say
-from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.report.page import Plot, draw_curve, write_page
+from ddrecon.report.pictures import pixels, shrink
+from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import (
     CHECKPOINTS,
     PREVIOUS,
@@ -50,11 +57,12 @@ from ddrecon.run.job import (
     require_same,
     work,
 )
-from ddrecon.run.report import list_numbers
+from ddrecon.run.report import list_numbers, psnr_text
 from ddrecon.run.result import RESULT, poses_of, put_values
 from ddrecon.run.run_folder import (
     LENGTHS,
     LOG,
+    REPORT,
     SCENE,
     SUMMARY,
     Iterations,
@@ -89,6 +97,16 @@ MOST_APART = 3
 SHARED, SEQUENCE, VELOCITY = "shared.json", "sequence", "velocity"
 """The file of what frames share, the folder of exported volumes, `film_0000.vdb` and so on, and the
 name of a frame's motion, and of its file."""
+
+RECORD = "film.json"
+KEYS = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
+"""Entries of a run's summary that a film's record keeps of each frame."""
+SHOWN = 48
+"""Frames whose pictures and volumes are on the page; all are in their folders."""
+WIDEST = 768
+"""Pixels across target, render and difference, at most."""
+REPORT_SHARE = 0.05
+"""While frames are made, their page takes no more than this part of the time."""
 
 
 @dataclass
@@ -136,16 +154,6 @@ class Film:
         """The frames that are finished."""
         return [n for n in self.frames.numbers if (self.of(n) / SUMMARY).is_file()]
 
-    def claim(
-        self, path: Path, kind: str, *, overwrite: bool = False, resume: bool = True
-    ) -> AbstractContextManager[Folder]:
-        """A folder of the film, or its own, for one of several processes that do parts of it.
-
-        The others wait, and say so, but for those that are to begin anew.
-        """
-        waiting = say if resume else None
-        return claim_folder(path, kind, overwrite=overwrite, resume=resume, tell=waiting)
-
     def scene_of(self, number: int) -> SceneFile:
         """The scene of the frame `number`, with what is shared fixed.
 
@@ -186,7 +194,7 @@ class Film:
             sums.append(torch.stack(values).sum(0))
         motion = find_flow(*sums) / (number - before) * self._cell
         for frame in (number, before):
-            with self.claim(self.of(frame), RUN):
+            with claim_folder(self.of(frame), RUN, resume=True):
                 if not volume_file(self.of(frame), VELOCITY).is_file():
                     write_volume(self.of(frame), VELOCITY, motion.flip(0), self.grid)
 
@@ -238,8 +246,7 @@ class Calibration(Iterations):
         texts = {name: text for name, _, text in numbers}
         content = {"frames": self.numbers, "values": values, "texts": texts}
         write_json(film.path / SHARED, content)
-        for file in (film.path / CHECKPOINTS).iterdir():
-            file.unlink()
+        rmtree(film.path / CHECKPOINTS)
         return content, []
 
 
@@ -254,33 +261,34 @@ def optimize_sequence(
     """The frames of the film in the scene file at `path`, one after another as they are done.
 
     `folder` keeps it, and a film that was left there goes on; without one nothing is kept.
-    `overrides` (`key.path=value`) are put in first. Raises as `open_film` and `drive_frames` do.
+    `overrides` (`key.path=value`) are put in first. Raises as `open_film` and `drive_frames` do,
+    and UsageError where another process writes to the folder.
     """
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         build = partial(build_scene, dtype=dtype, device=device)
         film = Film(read_scene(path, overrides), Path(place), build)
         if film.scene_file.tree.frames is None:
             raise SceneError(f"{path}: frames: missing section; say which, {{first: 0, last: 99}}")
-        open_film(film, None, overwrite=False, resume=True)
-        for number in drive_frames(film, film.frames.numbers):
-            scene = build(read_scene(film.of(number) / RESULT))
-            yield Result(scene, read_log(film.of(number) / LOG))
+        with claim_folder(film.path, FILM, resume=True) as claimed:
+            for number in drive_frames(film, claimed, open_film(film, claimed, is_resumed=True)):
+                scene = build(read_scene(film.of(number) / RESULT))
+                yield Result(scene, read_log(film.of(number) / LOG))
 
 
 def open_film(
     film: Film,
-    frame_range: str | None,
-    *,
-    overwrite: bool,
-    resume: bool,
+    folder: Folder,
+    frame_range: str | None = None,
     shared: Path | None = None,
-) -> None:
-    """Prepares the folder of `film` for its frames within `frame_range`.
+    *,
+    is_resumed: bool,
+) -> list[int]:
+    """The frames of `film` within `frame_range`, for which its claimed `folder` is prepared.
 
     Its calibration may be `shared` from a file. An earlier film's files of these frames are
-    removed, unless this one is to `resume` it. Raises UsageError for a folder that holds something
-    else, or another film, or where another process writes to such a frame; SceneError where
-    pictures are missing, or nothing is optimized.
+    removed, unless this one `is_resumed`. Raises UsageError where the folder holds another film, or
+    another process writes to such a frame; SceneError where pictures are missing, or nothing is
+    optimized.
     """
     scene_file, path = film.scene_file, film.path
     if not any(kind_of(name).is_cellwise for name in film.optimized):
@@ -288,46 +296,42 @@ def open_film(
         raise SceneError(f"{scene_file.path}: {text}")
     require_frames(scene_file)
     calibration = None if shared is None else read_shared(shared)
-    with film.claim(path, FILM, overwrite=overwrite, resume=resume) as folder:
-        chosen, old_scene = choose_frames(film.frames.numbers, frame_range), path / SCENE
-        is_same = (resume or frame_range is not None) and old_scene.is_file()
-        if is_same:
-            old, new = describe(read_scene(old_scene)), describe(scene_file)
-            for scene in (old, new):
-                scene.pop("frames", None)  # a film may grow
-                scene.get("optimize", {}).pop("iterations", None)
-            require_same(old, new, f"{path}: holds another film; use another output folder")
-        write_scene(scene_file, path)
-        if not resume:
-            folders = [f"frames/{number:04d}/" for number in chosen]
-            folders += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
-            inputs = [old_scene, scene_file.path, *referenced_files(scene_file)]
-            inputs += [] if shared is None else [shared]
-            folder.clear(inputs, folders if is_same else [""])
-        if calibration is not None:
-            file = path / SHARED
-            if file.is_file() and read_shared(file)["values"] != calibration["values"]:
-                raise UsageError(f"{file}: holds another calibration; leave --shared out")
-            write_json(file, calibration)
-        for number in film.frames.numbers:
-            note_written(film.of(number), "/")
+    chosen, old_scene = choose_frames(film.frames.numbers, frame_range), path / SCENE
+    is_same = (is_resumed or frame_range is not None) and old_scene.is_file()
+    if is_same:
+        old, new = describe(read_scene(old_scene)), describe(scene_file)
+        for scene in (old, new):
+            scene.pop("frames", None)  # a film may grow
+            scene.get("optimize", {}).pop("iterations", None)
+        require_same(old, new, f"{path}: holds another film; use another output folder")
+    write_scene(scene_file, path)
+    if not is_resumed:
+        folders = [f"frames/{number:04d}/" for number in chosen]
+        folders += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
+        inputs = [old_scene, scene_file.path, *referenced_files(scene_file)]
+        inputs += [] if shared is None else [shared]
+        folder.clear(inputs, folders if is_same else [""])
+    if calibration is not None:
+        file = path / SHARED
+        if file.is_file() and read_shared(file)["values"] != calibration["values"]:
+            raise UsageError(f"{file}: holds another calibration; leave --shared out")
+        write_json(file, calibration)
+    for number in film.frames.numbers:
+        note_written(film.of(number), "/")
+    return chosen
 
 
-def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
+def drive_frames(film: Film, folder: Folder, numbers: Sequence[int]) -> Iterator[int]:
     """Yields the frames `numbers` of `film` as they are finished, after its calibration.
 
     A frame that fails is named and left out; its error is raised when all others are done.
-    UsageError where another process does one of them.
     """
-    count, shared = film.frames.calibrate, film.path / SHARED
-    with film.claim(film.path, FILM) as folder:
-        if count and not shared.is_file():
-            job = Calibration(film, spread_out(film.frames.numbers, count))
-            if job.run.shared:
-                is_resumed = has_checkpoint(film.path / CHECKPOINTS)
-                work(job, folder, is_resumed)
-        film.shared = read_shared(shared) if shared.is_file() else {}
-    failures = list[DdreconError]()
+    shared, failures = film.path / SHARED, list[DdreconError]()
+    if film.frames.calibrate and not shared.is_file():
+        job = Calibration(film, spread_out(film.frames.numbers, film.frames.calibrate))
+        if job.run.shared:
+            work(job, folder, has_checkpoint(film.path / CHECKPOINTS))
+    film.shared = read_shared(shared) if shared.is_file() else {}
     for number in numbers:
         try:
             _drive_frame(film, number)
@@ -371,12 +375,6 @@ def export_film(film: Film, kind: str, up: str | None) -> None:
         path = film.path / SEQUENCE / f"film_{number:04d}.{kind}"
         turned = turn_up(fields, bounds, upright, up or upright)
         write_fields(path, *turned, {**facts, **constants})
-
-
-def share_out(numbers: Sequence[int]) -> Sequence[int]:
-    """This rank's share of the frames `numbers`, one after another; the first rank has some."""
-    begin, end = (-(-len(numbers) * (own_rank() + more) // rank_count()) for more in (0, 1))
-    return numbers[begin:end]
 
 
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
@@ -459,3 +457,117 @@ def fix_shared(described: dict[str, Any], values: Mapping[str, Any], source: Pat
         if not missing:
             del described["optimize"]["parameters"][name]
     put_values(described, values)
+
+
+def drive_film(
+    film: Film, folder: Folder, numbers: Sequence[int], exported: str | None, up: str | None
+) -> Outcome:
+    """Tells of `film` after its frames `numbers`, of which those that are done stay.
+
+    All that are done then are `exported` as volumes of this kind, in which the axis `up` points up.
+    Raises as `drive_frames` does.
+    """
+    due, finished = 0.0, film.done()
+    if stay := [str(number) for number in numbers if number in finished]:
+        say(f"frames that are finished stay as they are: {', '.join(stay)}")
+    try:
+        for number in drive_frames(film, folder, numbers):
+            if number not in finished and monotonic() >= due:
+                start = monotonic()
+                write_film_report(film)
+                due = monotonic() + (monotonic() - start) / REPORT_SHARE
+    finally:
+        outcome = write_film_report(film)
+    if exported is not None:
+        export_film(film, exported, up)
+    return outcome
+
+
+def write_film_report(film: Film) -> Outcome:
+    """Tells of the frames of `film` that are done; writes the record, `film.json`, and a page."""
+    rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
+    for number in film.done():
+        summary = summaries[number] = json.loads((film.of(number) / SUMMARY).read_text())
+        row = {key: summary[key] for key in KEYS if summary[key] is not None}
+        registered = summary.get("registered", {})
+        row |= {f"registered_{key}": value for key, value in registered.items()}
+        rows.append({"frame": number, **row})
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows}
+    if values := film.shared.get("values"):
+        record["values"] = values
+    write_json(film.path / RECORD, record)
+    if not rows:
+        return record, ["no frame is done"]
+    means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
+    registered = {
+        key.removeprefix("registered_"): value
+        for key, value in means.items()
+        if key.startswith("registered_")
+    }
+    lead = (
+        f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: "
+        f"{psnr_text({**means, 'registered': registered})}"
+    )
+    numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
+    write_page(
+        film.path / REPORT,
+        title=f"ddrecon: {film.path.absolute().name}",
+        lead=lead,
+        goes_on=len(rows) < record["asked"],
+        plots={"heading": "Quality", "drawn": _curves(rows)},
+        volume=_volumes(film, numbers),
+        frames={"numbers": numbers, "strips": _figures(film, summaries, numbers)},
+        numbers=_calibration(film.shared) if values else None,
+    )
+    return record, [lead]
+
+
+def _curves(rows: Sequence[Mapping[str, Any]]) -> list[Plot]:
+    drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
+    for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
+        series = {
+            name: [(float(row["frame"]), row[kind + key]) for row in rows if kind + key in row]
+            for name, kind in kinds.items()
+        }
+        drawn.append(draw_curve(title, {n: s for n, s in series.items() if s}, "frame"))
+    return drawn
+
+
+def _volumes(film: Film, numbers: Sequence[int]) -> dict[str, Any]:
+    """The fields of the frames `numbers`, and what stands around them by the last one."""
+    last = remove_pictures(read_scene(film.of(numbers[-1]) / RESULT), None)
+    fields = [
+        Shown(name, "result", value, number)
+        for number in numbers
+        for name, value in fields_in(film.of(number), film.optimized).items()
+    ]
+    world = describe_world(film.grid, film.build(last))
+    return describe_volume(fields, world, (), fields[0].name)
+
+
+def _figures(
+    film: Film, summaries: Mapping[int, Mapping[str, Any]], numbers: Sequence[int]
+) -> list[list[tuple[bytes, str]]]:
+    """Pictures of the views held out, or of the first one, in the frames `numbers`."""
+    views = next(iter(summaries.values()))["views"]
+    names = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
+    strips: list[list[tuple[bytes, str]]] = [[] for _ in names]
+    for name, strip in zip(names, strips, strict=True):
+        for number in numbers:
+            stored = read_image(film.of(number) / "previews" / f"{name}.png").pixels
+            image = shrink(torch.from_numpy(stored).permute(2, 0, 1), WIDEST)
+            psnr = summaries[number]["views"][name]["psnr"]
+            caption = f"{name}, frame {number}: {psnr:.2f} dB"
+            strip.append((webp_of(encode_bytes(pixels(image))), caption))
+    return strips
+
+
+def _calibration(shared: Mapping[str, Any]) -> dict[str, Any]:
+    """What all frames share."""
+    texts, frames = shared.get("texts", {}), ", ".join(map(str, shared.get("frames", [])))
+    return {
+        "heading": "Calibration",
+        "head": ["number", "value"],
+        "rows": [(name, texts.get(name, f"in {SHARED}")) for name in shared["values"]],
+        "text": f"Found from frames {frames} together.",
+    }

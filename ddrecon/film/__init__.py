@@ -1,1 +1,0 @@
-"""Films: a sequence of runs, one a frame, each begun with the last, and all of one calibration."""
