@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, rotation
-from ddrecon.defaults import choose_diffusion, find_occupied
+from ddrecon.defaults import choose_diffusion, choose_exchanges, find_occupied
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
@@ -65,8 +65,9 @@ class Scene:
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from; `ground` lies under the volume, where there is any. What
     `render` and `diffusion` leave out is chosen by the medium when the scene is made, and stays
-    when the medium changes. So does `occupied`, where there is a ground: where the part of the box
-    begins and ends, along z, y and x from 0 to 1, that has any medium. `reason`: which settings of
+    when the medium changes. So do `occupied` and `exchanges`, where there is a ground: where the
+    part of the box begins and ends, along z, y and x from 0 to 1, that has any medium; and how
+    often light goes to and fro between that and the ground. `reason`: which settings of
     `diffusion` these are, and why. `up`: which of x, y, z (0, 1, 2) points up; None where cameras
     tell.
     """
@@ -83,6 +84,7 @@ class Scene:
     reason: str = ""
     up: int | None = None
     occupied: tuple[Triple, Triple] | None = None
+    exchanges: int | None = None
 
     def __post_init__(self) -> None:
         self.settle()
@@ -96,6 +98,8 @@ class Scene:
         with torch.no_grad():
             if self.ground is not None and self.occupied is None:
                 self.occupied = find_occupied(volume, media, self.ground, optimized)
+                is_periodic = bool(volume.grid.periodic)
+                self.exchanges = choose_exchanges(self.ground, is_periodic, optimized)
             self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
             if self.render.steps_per_voxel is None:
                 steps = choose_steps(volume, self.diffusion.times)
