@@ -4,9 +4,7 @@
 
 Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
 radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`). `half-space` is
-one cell across, far wider than deep; all others have cubes, and a step cloud repeats. `box`: by how
-much, in percent, the image of a plain box changes from 8 to 16 rounds of degree 3, 5 and 7, in
-cells as they are.
+one cell across, far wider than deep; all others have cubes, and a step cloud repeats.
 
 NAME is part of a row's name; `seconds` are those of the default. Slabs need PythonicDISORT.
 """
@@ -14,19 +12,16 @@ NAME is part of a row's name; `seconds` are those of the default. Slabs need Pyt
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from figures import print_header, print_row
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "exact"))
-from published import PHASES, Layer, StepCloud, percent_off, show
+from published import PHASES, Layer, StepCloud, percent_off
 
 ROUNDS, DEGREES = (1, 4, 16), (3, 5)
 
@@ -85,36 +80,6 @@ LAYERS: dict[str, Layer | StepCloud] = {
         for cell in (4.0, 2.0, 1.0, 0.5)
     },
 }
-BOXES = {
-    f"box depth {depth} g {g} albedo {albedo}": (depth, g, albedo)
-    for depth, albedo in ((0.4, 0.999), (1.7, 0.95), (1.7, 0.999), (6.7, 0.999), (20.0, 0.999))
-    for g in (0.0, 0.6, 0.85, 0.95, -0.8)
-}
-"""By optical depth of a cell, g and albedo."""
-
-
-def box(depth: float, g: float, albedo: float) -> dict[str, Any]:
-    """24^3 cells of optical depth `depth`, seen by a perspective camera."""
-    camera = {
-        "type": "perspective",
-        "origin": [0, 0.4, 2.5],
-        "target": [0, 0, 0],
-        "up": [0, 1, 0],
-        "fov": 30,
-        "resolution": [32, 32],
-    }
-    return {
-        "volume": {
-            "bounds": {"min": [-0.5] * 3, "max": [0.5] * 3},
-            "resolution": [24] * 3,
-            "density": 1.0,
-            "sigma_t": 24 * depth,
-            "albedo": albedo,
-            "g": g,
-        },
-        "lights": [{"type": "directional", "direction": [-1, -2, -1], "irradiance": math.pi}],
-        "views": [{"name": "view", "camera": camera}],
-    }
 
 
 def print_layers(layers: dict[str, Layer | StepCloud]) -> None:
@@ -136,23 +101,6 @@ def print_layers(layers: dict[str, Layer | StepCloud]) -> None:
         print_row(name, *shown, f"{seconds['default']:.2f}")
 
 
-def print_boxes(boxes: Sequence[tuple[float, float, float]]) -> None:
-    """A row for each depth, a column for each g: changes from 8 to 16 rounds by degree."""
-    degrees, changes = (3, 5, 7), dict[tuple[float, float], dict[float, list[float]]]()
-    for numbers in boxes:
-        depth, g, albedo = numbers
-        row = changes.setdefault((depth, albedo), {}).setdefault(g, [])
-        for degree in degrees:
-            keys = ([*by_dial(n, degree), "diffusion.refine=1"] for n in (8, 16))
-            few, many = (show(box(*numbers), overrides) for overrides in keys)
-            row.append(percent_off(few, many))
-    columns = list(dict.fromkeys(g for _, g, _ in boxes))
-    print_header("depth of a cell, albedo", *(f"g {g:g}" for g in columns))
-    for (depth, albedo), found in changes.items():
-        cells = (", ".join(f"{change:.3f}" for change in found.get(g, [])) for g in columns)
-        print_row(f"{depth:g}, {albedo:g}", *cells)
-
-
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -160,14 +108,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     parts = given.only.split(",")
-    layers, boxes = (
-        {name: row for name, row in rows.items() if any(part in name for part in parts)}
-        for rows in (LAYERS, BOXES)
-    )
-    if layers:
-        print_layers(layers)
-    if boxes:
-        print_boxes([*boxes.values()])
+    print_layers({n: row for n, row in LAYERS.items() if any(part in n for part in parts)})
 
 
 if __name__ == "__main__":

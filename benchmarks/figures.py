@@ -34,10 +34,8 @@ COMMANDS = {
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
     "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
     "thick": "python benchmarks/accuracy.py thick",
-    "layers": "python benchmarks/dial.py --only step,half,slab,phantom",
-    "boxes": "python benchmarks/dial.py --only box",
+    "layers": "python benchmarks/dial.py",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
-    "rounds": "python benchmarks/speed.py rounds",
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
@@ -47,7 +45,6 @@ COMMANDS = {
     "engines": "python benchmarks/speed.py engines",
     "tangents": "python benchmarks/speed.py tangents",
     "launches": "python benchmarks/launches.py --as-a-gpu --engines warp",
-    "solvers": "python benchmarks/speed.py solvers",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
     "gpu": "python benchmarks/gpu_check.py speed",
@@ -69,7 +66,7 @@ SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
     ("the same, worst", "eleven", "worst", "default"),
     ("the same by diffusion alone (`transport_rounds: 0`): mean error", "eleven", "mean", "n = 0"),
-    ("the plume above: held-out PSNR", "plume", "as the config has it", "held out"),
+    ("the plume of the two commands: held-out PSNR", "plume", "as the config has it", "held out"),
     ("relative L1 error of its density", "plume", "as the config has it", "L1"),
     ("seconds of the whole process", "plume", "as the config has it", "seconds"),
     (
@@ -239,7 +236,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
-    parser.add_argument("--show", choices=[*COMMANDS])
+    parser.add_argument("--show", choices=sorted({*COMMANDS, *read_store()}))
     given = parser.parse_args()
     if given.show:
         print(show(given.show, read_store()))

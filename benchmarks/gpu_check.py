@@ -1,18 +1,19 @@
-"""What some minutes of a GPU are to tell: cost of single things, agreement, speed, bits, shortage.
+"""What some minutes of a GPU are to tell, and what matters most first.
 
     python benchmarks/gpu_check.py [STAGE]... [--device cuda] [--shrink 1] [--engine warp]
 
-Without names all stages run, in their order: machine, kernels, agree, speed, graphs, top, bits,
-tests, optimize, shortage. Each prints its table and the seconds it took; what fails says so, and
-the next stage goes on. `--device cpu --shrink 4` tries the script where there is no GPU: grids and
-images are four times smaller. Stages that take longest are `agree`, which computes all scenes of
-`configs` on the processor as well, and `speed`.
+Without names all stages run, in their order: machine, kernels, speed, agree, bits, graphs,
+optimize, tests, top, shortage. Each prints its table line by line, and the seconds it took. A stage
+that fails says so, the next one goes on, and the exit status is 1. All of it is also in
+`$OUT/gpu_check.txt`, where that is set. `--device cpu --shrink 4` tries the script where there is
+no GPU: grids and images are four times smaller, and kernels are not optimized.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import subprocess
 import sys
 import tempfile
@@ -31,7 +32,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.errors import MissingExtraError, SceneError
+from ddrecon.errors import MissingExtraError, SceneError, UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
@@ -46,6 +47,9 @@ ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
 CELLS = 3000
 """Scenes are compared in at most about so many cells."""
+AGREEMENT = 1e-9
+"""What else than rounding makes a difference is more: solves end at the same iteration."""
+COMMAND = "from ddrecon.cli import main; main()"
 SECONDS = 6.0
 """So long iterations of one run are timed, at most twelve of them."""
 
@@ -62,6 +66,13 @@ class Check:
     def is_gpu(self) -> bool:
         return self.device.type == "cuda"
 
+    @property
+    def setting(self) -> str:
+        """What a process does before all else: what is only tried is compiled as tests do it."""
+        if self.shrink == 1 or self.engine == "torch":
+            return ""
+        return "import warp; warp.config.optimization_level = 0"
+
     def now(self) -> float:
         """The time, once the device has done what it was given."""
         if self.is_gpu:
@@ -77,7 +88,7 @@ class Check:
         return (self.now() - start) / count
 
     def runs(self) -> dict[str, Callable[[], Reconstruction]]:
-        """Reconstructions by name; the paper's times are of an RTX 2080 Ti."""
+        """Reconstructions by name, the largest shrunk twice; the paper's are of an RTX 2080 Ti."""
         n = self.shrink
         return {
             "64 x 96 x 64, 256^2, no round (the paper: 29.4/s)": lambda: self.plume(64, 256, 0),
@@ -89,7 +100,7 @@ class Check:
             "plume.yaml, 64 x 96 x 64": lambda: self.config_plume(n),
             "capture.yaml, full resolution": self.capture,
             "168 x 252 x 168, 512^2, RGB fields, a round (the paper: 8 s)": self.joint,
-            "256 x 384 x 256, 512^2, a round": lambda: self.plume(256, 512, 1),
+            "256 x 384 x 256, 512^2, a round": lambda: self.plume(256 // n, 512, 1),
         }
 
     def plume(self, cells: int, pixels: int, rounds: int) -> Reconstruction:
@@ -101,7 +112,7 @@ class Check:
 
     def joint(self) -> Reconstruction:
         """The paper's joint case: density, sigma_a and sigma_s in three colors."""
-        scene = plume_scene(168 // self.shrink, 512 // self.shrink, torch.float32, self.device)
+        scene = plume_scene(168 // self.shrink**2, 512 // self.shrink, torch.float32, self.device)
         volume, shape = scene.volume, (3, *scene.volume.grid.shape)
         colors = torch.tensor([1.0, 0.9, 0.7], device=self.device).view(3, 1, 1, 1)
         fields = {
@@ -165,10 +176,10 @@ def kernels(check: Check) -> Iterator[str]:
         yield f"{name}: first iteration {check.now() - start:.1f} s"
 
 
-def results(path: Path, device: torch.device) -> dict[str, Tensor]:
+def results(path: Path, device: torch.device, cells: float) -> dict[str, Tensor]:
     """What is compared of a scene file, by name, in double precision, from a random density."""
     scene = load_scene(path, dtype=torch.float64, device=device)
-    factor = max(1, round((scene.volume.grid.cells / CELLS) ** (1 / 3)))
+    factor = max(1, round((scene.volume.grid.cells / cells) ** (1 / 3)))
     scene = scene_at_level(scene, factor)
     # A processor would take fewer rays where pixels are finer than cells, and a GPU would not.
     scene = replace(scene, views=scene.views[:2], render=replace(scene.render, tolerance=0.0))
@@ -197,29 +208,30 @@ def results(path: Path, device: torch.device) -> dict[str, Tensor]:
 
 
 def agree(check: Check) -> Iterator[str]:
-    """How far scenes in double precision are from torch's on the processor, and what is farthest.
-
-    1e-9 and less is agreement: solves end at the scenes' own tolerances, at the same iteration.
-    """
+    """How far scenes in double precision are from torch on the processor, and what is farthest."""
+    engines = sorted({check.engine, "torch"} if check.is_gpu else {check.engine})
+    cells, farthest = CELLS / check.shrink, list[float]()
     yield "| scene | engine | light | farthest | of |\n|---|---|---|---|---|"
     for path in sorted([*CONFIGS.glob("*.yaml"), *CONFIGS.glob("kinds/*.yaml")]):
         use_engine("torch")
         try:
-            known = results(path, torch.device("cpu"))
+            known = results(path, torch.device("cpu"), cells)
         except (MissingExtraError, SceneError) as error:  # of a volume that is not there
             yield f"| {path.stem} | - | - | - | {error} |"
             continue
-        for engine in ENGINES if check.engine == "warp" else ("torch",):
+        for engine in engines:
             use_engine(engine)
             errors = {
                 name: float(
                     (value.cpu() - known[name]).norm() / known[name].norm().clamp(min=1e-300)
                 )
-                for name, value in results(path, check.device).items()
+                for name, value in results(path, check.device, cells).items()
             }
             far = max(errors, key=lambda name: errors[name])
+            farthest.extend(errors.values())
             yield f"| {path.stem} | {engine} | {errors['light']:.0e} | {errors[far]:.0e} | {far} |"
     use_engine(check.engine)
+    assert all(error <= AGREEMENT for error in farthest), f"farther than {AGREEMENT}"
 
 
 def speed(check: Check) -> Iterator[str]:
@@ -236,8 +248,8 @@ def measure(check: Check, run: Reconstruction) -> str:
     """Cells of the table of `speed`."""
     if check.is_gpu:
         torch.cuda.reset_peak_memory_stats()
-    taken, most = list[float](), 2 + max(2, 12 // check.shrink)
-    while len(taken) < 3 or (len(taken) < most and sum(taken) < SECONDS):
+    taken = list[float]()
+    while len(taken) < 3 or (len(taken) < 14 // check.shrink and sum(taken) < SECONDS):
         start = check.now()
         run.step()
         taken.append(check.now() - start)
@@ -280,6 +292,7 @@ def graphs(check: Check) -> Iterator[str]:
             f"{name}: {seconds[0]:.4f} s plainly, {seconds[1]:.4f} s replayed "
             f"(recorded: {is_recorded}), apart {apart:.1e}"
         )
+        assert is_recorded == check.is_gpu
 
 
 def top(check: Check) -> Iterator[str]:
@@ -307,52 +320,66 @@ def bits(check: Check) -> Iterator[str]:
                 run.step()
             ends.append(run.parameters[0].value.detach())
         yield f"{name}: {float((ends[0] - ends[1]).norm() / ends[0].norm()):.1e}"
+        assert torch.equal(*ends)
+
+
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A process of its own, which has four minutes."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
 
 
 def tests(check: Check) -> Iterator[str]:
-    """The tests that run on a GPU where there is one."""
-    command = [sys.executable, "-m", "pytest", "-n0", "-q", "tests/test_far_device.py"]
-    end = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    """The tests that run on a GPU where there is one; elsewhere the shortest of a device's."""
+    chosen = "cuda" if check.is_gpu else f"far and table and {check.engine}"
+    end = run_python("-m", "pytest", "-n0", "-q", "tests/test_far_device.py", "-k", chosen)
     yield "\n".join((end.stdout + end.stderr).splitlines()[-8:])
+    assert end.returncode == 0
 
 
 def optimize(check: Check) -> Iterator[str]:
     """The plume from the command line, as anybody runs it."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "ddrecon", "optimize", str(CONFIGS / "plume.yaml")]
-        command += ["-o", folder, "--overwrite", "--device", check.device.type]
-        command += ["--engine", check.engine]
+        command = ["-c", f"{check.setting}\n{COMMAND}"]
+        command += ["optimize", str(CONFIGS / "plume.yaml"), "-o", folder, "--overwrite"]
+        command += ["--device", check.device.type, "--engine", check.engine]
         if check.shrink > 1:
-            command += ["--iterations", "3"]
+            sizes = [size // check.shrink for size in (64, 96, 64)]
+            command += ["--iterations", "3", "-D", f"volume.resolution={sizes}"]
         start = time.perf_counter()
-        end = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        end = run_python(*command)
         yield "\n".join((end.stdout + end.stderr[-600:]).splitlines()[-12:])
         yield f"exit {end.returncode}, {time.perf_counter() - start:.1f} s the whole process"
+        assert end.returncode == 0
 
 
 def shortage(check: Check) -> Iterator[str]:
-    """What is said where memory is short: of a quarter of a GiB on a GPU, of a limit elsewhere."""
+    """What is said where memory is short: of a quarter of a GiB on a GPU."""
     if not check.is_gpu:
         yield "no GPU, no shortage"
         return
     whole = torch.cuda.get_device_properties(0).total_memory
-    text = (
-        f"import torch; torch.cuda.set_per_process_memory_fraction({2**28 / whole}); "
-        "from ddrecon.cli import main; main()"
-    )
+    setting = f"import torch; torch.cuda.set_per_process_memory_fraction({2**28 / whole})"
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-c", text, "optimize", str(CONFIGS / "plume.yaml")]
-        command += ["-o", folder, "--overwrite", "--device", "cuda"]
-        command += ["-D", "volume.resolution=[192,288,192]"]
-        end = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        command = [
+            "-c",
+            f"{setting}; {COMMAND}",
+            "optimize",
+            str(CONFIGS / "plume.yaml"),
+            "-o",
+            folder,
+        ]
+        command += ["--overwrite", "--device", "cuda", "-D", "volume.resolution=[192,288,192]"]
+        end = run_python(*command)
     yield f"exit {end.returncode}: {end.stderr[-900:]}"
+    assert end.returncode == UsageError.exit_code
 
 
-STAGES = (machine, kernels, agree, speed, graphs, top, bits, tests, optimize, shortage)
+STAGES = (machine, kernels, speed, agree, bits, graphs, optimize, tests, top, shortage)
 
 
 def main() -> None:
-    """Prints what each stage finds."""
+    """Prints what each stage finds; ends with status 1 if one failed."""
     names = {stage.__name__: stage for stage in STAGES}
     parser = argparse.ArgumentParser()
     parser.add_argument("stages", nargs="*", choices=[[], *names], metavar="STAGE")
@@ -362,14 +389,25 @@ def main() -> None:
     arguments = parser.parse_args()
     check = Check(torch.device(arguments.device), arguments.shrink, arguments.engine)
     use_engine(check.engine)
+    folder, failed = os.environ.get("OUT"), False
+    exec(check.setting)
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+        if folder:
+            with Path(folder, "gpu_check.txt").open("a", encoding="utf-8") as file:
+                print(line, file=file)
+
     for name in arguments.stages or names:
         start = time.perf_counter()
         try:
             for line in names[name](check):
-                print(line, flush=True)
+                tell(line)
         except Exception as error:  # the next stage goes on
-            print(f"FAILED {name}: {''.join(traceback.format_exception(error)[-3:])}", flush=True)
-        print(f"-- {name}: {math.ceil(time.perf_counter() - start)} s", flush=True)
+            failed = True
+            tell(f"FAILED {name}: {''.join(traceback.format_exception(error)[-3:])}")
+        tell(f"-- {name}: {math.ceil(time.perf_counter() - start)} s")
+    sys.exit(failed)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,4 @@
-"""Peak memory against what `ddrecon check` predicts, and bytes per cell and color of a forward and
-adjoint solve.
+"""Peak memory against what `ddrecon check` predicts.
 
     python benchmarks/memory.py [--count]
 
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from figures import print_header, print_row, run
+from figures import ddrecon, print_header, print_row
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -40,16 +39,6 @@ CASES: dict[str, tuple[dict[str, object], dict[str, object], tuple[str, ...]]] =
     "density, sigma_a and sigma_s, g 0.3": (BOTH | {"g": 0.3}, {}, ("sigma_a", "sigma_s")),
 }
 """What is said of the medium and of diffusion, and the fields that are sought beside density."""
-SOLVE = """
-import sys, torch
-from pathlib import Path
-from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.lighting import solve_light
-from ddrecon.scene_file.build import load_scene
-scene = load_scene(Path(sys.argv[1]))
-density = scene.volume.density.requires_grad_()
-torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse[0].sum(), density)
-"""
 
 
 def write_scene(folder: Path, cells: int, pixels: int, title: str, is_optimized: bool) -> Path:
@@ -133,14 +122,11 @@ def count(folder: Path, cells: int, title: str) -> tuple[float, float, str]:
 
 def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tuple[float, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
-    path = str(write_scene(folder, cells, pixels, title, verb == "optimize"))
-    program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
-    check = [*program, "check", path, "--json"]
+    path = write_scene(folder, cells, pixels, title, verb == "optimize")
+    check = [sys.executable, "-m", "ddrecon", "check", path, "--json"]
     report = subprocess.run(check, capture_output=True, text=True, check=True).stdout
-    command = [*program, verb, path, "-o", str(folder / verb), "--overwrite", "-q"]
-    if verb == "solve":
-        command = [sys.executable, "-c", SOLVE, path]
-    return run(command).memory * 2**20, int(json.loads(report)["memory_bytes"])
+    used = ddrecon(verb, path, "-o", folder / verb)
+    return used.memory * 2**20, int(json.loads(report)["memory_bytes"])
 
 
 def main() -> None:
@@ -158,20 +144,15 @@ def main() -> None:
                 render, iteration, where = count(folder, 48, title)
                 print_row(title, f"{render:.0f}", f"{iteration:.0f}", where)
             return
-        solved = "solve, there and back [bytes per cell and color]"
-        print_header("scene", "cells", solved, "command", "peak [MiB]", "predicted / peak")
-        for title, (medium, *_) in CASES.items():
-            verbs = ("solve", "render", "optimize")
-            bases = {verb: measure(folder, verb, SMALL, 16, title)[0] for verb in verbs}
-            colors = 3 if {"albedo", "sigma_a"} & {*medium} else 1
-            for cells in options.cells:
-                solve = measure(folder, "solve", cells, 16, title)[0] - bases["solve"]
-                number = solve / (cells**3 - SMALL**3) / colors
-                for verb in verbs[1:]:
+        print_header("scene", "cells", "command", "peak [MiB]", "predicted / peak")
+        for title in CASES:
+            for verb in ("render", "optimize"):
+                base = measure(folder, verb, SMALL, 16, title)[0]
+                for cells in options.cells:
                     taken, predicted = measure(folder, verb, cells, 256, title)
-                    used = taken - bases[verb]
+                    used = taken - base
                     figures = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
-                    print_row(title, f"{cells}^3", f"{number:.0f}", verb, *figures)
+                    print_row(title, f"{cells}^3", verb, *figures)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,6 @@ from paper_figures import (
     Log,
     Pair,
     draw,
-    draw_derivatives,
     pace,
     project,
     read_log,
@@ -157,25 +156,6 @@ def draw_rounds(runs: Runs) -> None:
         lines.append(f"| {' | '.join(map(str, cells))} |")
     draw(PICTURES / "fig13_rounds.png", pairs, {})
     keep("fig13", "python benchmarks/paper.py fig13", lines)
-
-
-def draw_parts(runs: Runs) -> None:
-    """Fig. 9: derivatives of pixels by density, of each part of the radiance, at the start and at
-    what each run found.
-    """
-    images, single = [], ("reduced", "single")
-    parts = {"single": single, "diffusion": ("multiple",), "all": (*single, "multiple")}
-    bunny = as_options([f"volume.density={{file: {SHAPES}/bunny.npz}}"])
-    options = ["--view", "front", "--components", "--gradient", "density"]
-    for name in parts:
-        run = runs[name].folder
-        starts = {"at the bunny": (CONFIGS / "fig09.yaml", bunny), "in the end": (run, [])}
-        for words, (scene, overrides) in starts.items():
-            folder = run / f"derivative_{words[:2]}"
-            ddrecon("render", scene, "-o", folder, *options, *overrides)
-            files = (folder / f"front.gradient.{part}.npy" for part in parts[name])
-            images.append((f"{name}, {words}", sum(np.load(file).mean(-1) for file in files)))
-    draw_derivatives(PICTURES / "fig09_derivatives.png", images)
 
 
 def show_light(runs: Runs) -> tuple[list[Pair], str]:
@@ -310,7 +290,7 @@ EXPERIMENTS = {
     "fig12_single": Experiment(show_smoke),
     "fig12_four": Experiment(show_four),
     "fig07": Experiment(show_density("cloud", "front")),
-    "fig09": Experiment(show_derivatives, PARTS, draw_more=draw_parts),
+    "fig09": Experiment(show_derivatives, PARTS),
     "fig14": Experiment(show_photograph),
 }
 """By their configs, in the order of docs/experiments.md."""

@@ -87,20 +87,6 @@ def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
     save(figure, path)
 
 
-def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
-    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter,
-    blue where darker, each to a scale.
-    """
-    figure, axes = plt.subplots(
-        1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained"
-    )
-    for axis, (title, image) in zip(axes, images, strict=True):
-        full = float(np.quantile(np.abs(image), 0.999))
-        show_signed(axis, image, full, title)
-        axis.set_xlabel(f"to {full:.2g}", fontsize=7)
-    save(figure, path)
-
-
 def show_signed(axis: Any, values: Array, full: float, title: str) -> None:
     """Draws a signed map on `axis`: white is 0, red is `full`, blue minus that."""
     axis.imshow(values, cmap="RdBu_r", vmin=-full, vmax=full)

@@ -191,7 +191,8 @@ def print_film(folder: Path) -> None:
     alone, used_alone = run_film(folder / "alone", *keys)
     one, other = film["frames"][-1], alone["frames"][-1]
     print_header("what", "five frames of the film", "the last of them alone")
-    print_row("held out, last frame [dB]", *(f"{row['test_psnr']:.1f}" for row in (one, other)))
+    for what, key in (("held out", "test_psnr"), ("the same, registered", "registered_psnr")):
+        print_row(f"{what}, last frame [dB]", f"{one[key]:.1f}", f"{other[key]:.1f}")
     in_film = [row["seconds"] for row in film["frames"][1:]]
     print_row(
         "seconds of a frame, later ones", f"{np.mean(in_film):.1f}", f"{other['seconds']:.1f}"

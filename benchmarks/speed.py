@@ -1,9 +1,8 @@
 """What images, derivatives and solves take on this machine: a table in Markdown for each stage.
 
-    python benchmarks/speed.py rounds|solvers|scale|engines|tangents [--threads 2]
+    python benchmarks/speed.py scale|engines|tangents [--threads 2]
 
-`rounds`: a render of the plume by transport rounds and degree, relative to none. `solvers`:
-iterations of multigrid from zero. `scale`: seconds of an iteration of a reconstruction of the plume
+`scale`: seconds of an iteration of a reconstruction of the plume
 of `ddrecon.validate.hard`, from half its density and its own images, as one thing grows at a time:
 cells (with them the width of the image, two pixels a cell), pixels, views, lights, colors; and the
 exponents fitted to them. `engines`: both engines, by turns in one process; how far apart they are.
@@ -28,19 +27,12 @@ import torch
 from figures import print_header, print_row
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.nn.functional import interpolate
 
 from ddrecon.cameras import look_at
-from ddrecon.diffusion.closures import Closure
-from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.light.reduced import receive_light
-from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
@@ -51,13 +43,6 @@ from ddrecon.variables.values import value_of, with_values
 
 ROOT = Path(__file__).parents[1]
 PLUME, DENSITY = ROOT / "configs/plume.yaml", ROOT / "data/plume/density.npz"
-MEDIA = {
-    "gray": ["volume.albedo=0.95", "render.samples_per_pixel=1"],
-    "RGB": ["render.samples_per_pixel=1"],
-    "RGB, 16 rays a pixel": ["render.samples_per_pixel=16"],
-}
-ROUNDS = ((0, 3), (1, 1), (1, 3), (2, 3), (3, 3), (1, 5), (2, 5), (3, 5))
-"""Rounds and degrees."""
 CELLS = (16, 24, 32, 48, 64, 96, 128, 192)
 LARGE = "views.0.image=null", "views.0.camera.resolution=[512, 512]"
 GRAY = "volume.albedo=0.95", *LARGE
@@ -85,53 +70,6 @@ TANGENTS = ("density", "sigma_t", "albedo")
 
 def read_plume() -> Tensor:
     return torch.tensor(read_field(DENSITY, "density").values)
-
-
-def print_rounds() -> None:
-    """The least of three renders of the first view, solves from zero."""
-    torch.set_num_threads(1)
-
-    def seconds(scene: Scene) -> float:
-        taken = []
-        for _ in range(4):
-            start = time.process_time()
-            with torch.no_grad():
-                render_each(scene, scene.views[:1], SolveMemory())
-            taken.append(time.process_time() - start)
-        return min(taken[1:])
-
-    truth = [f"volume.density={{file: {DENSITY}}}", "optimize.parameters.density={}"]
-    columns = []
-    for overrides in MEDIA.values():
-        scene = load_scene(PLUME, overrides=[*truth, *overrides])
-        settings = [replace(scene.diffusion, transport_rounds=n, degree=d) for n, d in ROUNDS]
-        columns.append([seconds(replace(scene, diffusion=diffusion)) for diffusion in settings])
-    print_header("n", "degree", *MEDIA)
-    for index, (rounds, degree) in enumerate(ROUNDS):
-        ratios = (f"{column[index] / column[0]:.1f}" for column in columns)
-        print_row(rounds, degree if rounds else "-", *ratios)
-
-
-def print_solvers() -> None:
-    """Of the plume and of a nearly empty box, in three colors of albedo 0.999, 0.9 and 0.8."""
-    print_header("medium, cells, tolerance", "iterations")
-    for shape in [(n, n, n) for n in (32, 64, 128)] + [(64, 96, 64)]:
-        plume = interpolate(read_plume()[None, None], size=shape, mode="trilinear")[0, 0]
-        media = {"plume": (plume, 40.0), "nearly empty": (torch.full(shape, 1e-3), 12.0)}
-        half = [count / shape[2] / 2 for count in shape]
-        grid = Grid(shape, tuple(-side for side in half), tuple(half))
-        albedo = torch.tensor([0.999, 0.9, 0.8])
-        light = DirectionalLight(torch.tensor([-2.0, -2.0, -1.0]), torch.full((3,), 3.14))
-        for name, (density, sigma_t) in media.items():
-            sigmas = sigma_t * (1 - albedo), sigma_t * albedo
-            medium = scale_medium(Volume(grid, density, *sigmas, torch.tensor(0.3)))
-            source = receive_light(medium, [light], 1).source
-            closure, outside = Closure("geometric", grid), torch.zeros(1, 1, 1, 1)
-            with torch.no_grad():
-                system = DiffusionProblem(medium, closure, source, outside, True).system
-            for tolerance in (1e-3, 1e-6):
-                iterations = solve_by_multigrid(*system, None, tolerance).iterations
-                print_row(f"{name}, {' x '.join(map(str, shape))}, {tolerance:.0e}", iterations)
 
 
 def start_run(scene: Scene, names: Sequence[str] = ("density",)) -> Reconstruction:
@@ -270,8 +208,6 @@ def print_tangents() -> None:
 
 
 STAGES = {
-    "rounds": print_rounds,
-    "solvers": print_solvers,
     "scale": print_scale,
     "engines": print_engines,
     "tangents": print_tangents,

@@ -80,22 +80,6 @@ def with_traced(scene: Scene, truth: Path, folder: Path) -> Scene:
     )
 
 
-def finish(scene: Scene) -> Reconstruction:
-    """A run of `scene`, at its end."""
-    run = Reconstruction(scene)
-    while not run.is_done:
-        run.step()
-    return run
-
-
-def experiment(run: Reconstruction, experiments: int) -> Uncertainty:
-    """So many `experiments` about `run`, made."""
-    found = Uncertainty(run, seed=0)
-    while found.count < experiments:
-        found.step()
-    return found
-
-
 def judge(known: Known, experiments: int) -> dict[str, Any]:
     """How often the truth is within one and two deviations, of cells that hold smoke in truth.
 
@@ -103,8 +87,12 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
     errors in the cells around.
     """
     scene, truth = known
-    run = finish(scene)
-    deviations = experiment(run, experiments)
+    run = Reconstruction(scene)
+    while not run.is_done:
+        run.step()
+    deviations = Uncertainty(run, seed=0, wanted=experiments)
+    while not deviations.is_done:
+        deviations.step()
     field, truth = deviations.fields()["density"], resample(truth, run.level.train.volume.grid)
     smoke, error = truth > EMPTY * truth.max(), (field.value - truth).abs()
     row: dict[str, Any] = {"cells": int(smoke.sum())}

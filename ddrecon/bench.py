@@ -7,7 +7,6 @@ tracing by Mitsuba 3, where that is installed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from ddrecon.errors import SolveError
 from ddrecon.picture import render_each
 from ddrecon.progress import Progress, table_lines
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
+from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import plume_scene, relative_error
 from ddrecon.variables.values import with_values
@@ -39,7 +38,7 @@ QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 COLUMNS = {"name": "", "image_seconds": ".3f", "both_seconds": ".3f", "times_base": ".2f"}
 COLUMNS |= {"iterations": "", "image_numerical": ".1e", "gradient_numerical": ".1e"}
-COLUMNS |= {"image_error": "", "verdict": ""}
+COLUMNS |= {"image_error": ""}
 
 
 @dataclass(frozen=True)
@@ -117,15 +116,6 @@ def shoot(scene: Scene) -> Shot:
     return Shot(image.detach(), gradient, middle - start, end - middle, iterations)
 
 
-def exact_scene(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
-    marched in finer steps, ray by ray.
-    """
-    marching = replace(scene.render, steps_per_voxel=max(3, scene.render.steps), tolerance=0.0)
-    diffusion = replace(scene.diffusion, tolerance=1e-8, warm_start=False)
-    return replace(scene, render=marching, diffusion=diffusion)
-
-
 def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
     """An image by so many paths a pixel."""
     start = perf_counter()
@@ -141,15 +131,18 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. `is_best`: no
-    other row is known to be faster and as close to the truth.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
     }
     exact, solved = dict[str, Shot](), dict[tuple[object, ...], Shot]()
     for name, variant in progress([*variants_of(double, is_quick).items()], "exact solutions"):
-        as_exact = exact_scene(variant)
+        marching = replace(
+            variant.render, steps_per_voxel=max(3, variant.render.steps), tolerance=0.0
+        )
+        diffusion = replace(variant.diffusion, tolerance=1e-8, warm_start=False)
+        as_exact = replace(variant, render=marching, diffusion=diffusion)
         key = _settings(replace(as_exact, render=double.render))
         if key not in solved:  # alike ones are solved once
             solved[key] = shoot(as_exact)
@@ -163,7 +156,6 @@ def run_bench(
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
-    mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
     return {
         "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
@@ -207,29 +199,13 @@ def row_of(
     }
 
 
-def mark_best(rows: list[dict[str, Any]], noise: float) -> None:
-    """Marks the `rows` that no other beats in both time of an image and error.
-
-    An error against path tracing is at least what the `noise` of that can tell from none.
-    """
-
-    def error(row: dict[str, Any]) -> float:
-        if row["image_error"] is not None:
-            return max(row["image_error"], least_error(noise))
-        return math.inf if row["image_numerical"] is None else row["image_numerical"]
-
-    for row in rows:
-        faster = (other for other in rows if other["image_seconds"] < row["image_seconds"])
-        row["is_best"] = all(error(other) > error(row) for other in faster)
-
-
 def bench_lines(report: Mapping[str, Any]) -> list[str]:
     """The report as a Markdown table, and Mitsuba's time; times are multiples of the base's."""
     rows, noise, base = list[dict[str, Any]](), report["truth_noise"], report["rows"][0]
     for row in report["rows"]:
-        times, verdict = row["both_seconds"] / base["both_seconds"], "best" * row["is_best"]
+        times = row["both_seconds"] / base["both_seconds"]
         error = None if noise is None else error_text(row["image_error"], noise)
-        rows.append(row | {"times_base": times, "image_error": error, "verdict": verdict})
+        rows.append(row | {"times_base": times, "image_error": error})
     lines = table_lines(COLUMNS, rows)
     if noise is not None:
         times = rows[-1]["image_seconds"] / base["image_seconds"]

@@ -47,6 +47,7 @@ from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import pixels, shrink
+from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import (
     CHECKPOINTS,
     PREVIOUS,
@@ -56,7 +57,7 @@ from ddrecon.run.job import (
     require_same,
     work,
 )
-from ddrecon.run.report import describe_fields, list_numbers, psnr_text
+from ddrecon.run.report import list_numbers, psnr_text
 from ddrecon.run.result import RESULT, poses_of, put_values
 from ddrecon.run.run_folder import (
     LENGTHS,
@@ -536,11 +537,12 @@ def _volumes(film: Film, numbers: Sequence[int]) -> dict[str, Any]:
     """The fields of the frames `numbers`, and what stands around them by the last one."""
     last = remove_pictures(read_scene(film.of(numbers[-1]) / RESULT), None)
     fields = [
-        (name, "result", value, number)
+        Shown(name, "result", value, number)
         for number in numbers
         for name, value in fields_in(film.of(number), film.optimized).items()
     ]
-    return describe_fields(film.build(last), fields, (), fields[0][0])
+    world = describe_world(film.grid, film.build(last))
+    return describe_volume(fields, world, (), fields[0].name)
 
 
 def _figures(

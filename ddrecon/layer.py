@@ -19,13 +19,7 @@ from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene, require_above
 from ddrecon.variables.kinds import PAIRS
-from ddrecon.variables.values import (
-    is_real,
-    require_legal,
-    require_scene,
-    shapes_of,
-    with_values,
-)
+from ddrecon.variables.values import is_real, require_legal, require_scene, shapes_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""

@@ -49,7 +49,7 @@ THICKEST, THINNEST = 3e3, 1e-3
 """Optical depths beyond these look like a wall, or like nothing."""
 THICK_FACES, ABSORBING, FINEST = 2.0, 2.5, 100.0
 """A cell at a face of extinction k, the forward peak left out, and absorption a is too thick where
-k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/hard_cases.md).
+k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/reliability.md).
 Nobody takes cells 100 times smaller."""
 FORWARD = 0.5
 """From this mean cosine on g may be traded for fewer scatterings."""
@@ -80,11 +80,7 @@ def _find_terms(scene: Scene) -> Iterator[str]:
         yield f"{emission}, {'scattered and seen' if is_diffuse else 'only seen: not scattered'}"
     if volume.index != 1:
         inside = 1 - transmitted_moments(volume.index)[0]
-        outside = ((volume.index - 1) / (volume.index + 1)) ** 2
-        yield (
-            f"refractive index {volume.index:g}: faces reflect {inside:.1%} of diffuse light "
-            f"inside, and {outside:.1%} of light from straight ahead"
-        )
+        yield f"refractive index {volume.index:g}: faces reflect {inside:.1%} of light inside"
     if is_diffuse:
         yield from _diffuse_terms(medium, scene)
     else:

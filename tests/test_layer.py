@@ -22,6 +22,7 @@ from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.pictures import Noise
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
 from ddrecon.variables.values import value_of, variable_names, with_values
 
@@ -269,7 +270,8 @@ RECORDS: dict[str, list[Any]] = {
     "lights": [[SUN], [None]],
     "views": [[None]],
     "ground": [Ground(tensor(0.5), Plane(NAN, 1)), Ground(tensor(0.5), Plane(-9.0, 7))],
-    "diffusion": [{}],
+    "diffusion": [{}, DiffusionSettings(degree=4), DiffusionSettings(tolerance=NAN)],
+    "render": [RenderSettings(samples_per_pixel=0)],
     "volume.phase": [None],
     "volume.black_body": [2000.0],
     "volume.support": [torch.ones(2, 2, 2)],

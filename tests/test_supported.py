@@ -1,9 +1,7 @@
 """What is not computed together is refused from Python as from a file, in the same words."""
 
-import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +9,12 @@ import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
 
-from ddrecon.errors import SceneError, UsageError
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.layer import VolumeRenderer, fluence, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.scene import Scene
-from ddrecon.scene_file.build import load_scene
 
 SHAPE = (3, 4, 5)
 PERIOD = "volume.periodic is for model p1 with scheme conservative, or none"
@@ -62,47 +59,6 @@ def test_what_a_file_may_not_say_python_may_not(
     for call in (render, fluence, lambda scene: VolumeRenderer(scene)()):
         with pytest.raises(UsageError, match=re.escape(problem)):
             call(scene)
-
-
-BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
-GROUND = "ground={height: -2, albedo: 0.3}"
-LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
-INSIDE = "views.0.camera.origin=[0, 0, 0.2]"
-FILES = [
-    (["volume.periodic=[x,x]"], "volume.periodic: name one axis or two"),
-    (["volume.periodic=[w]"], "volume.periodic.0: expected one of x, y, z"),
-    (["volume.periodic=[x]", LAMP], "lights.0: a PointLight does not repeat"),
-    ([GROUND, "ground.height=0"], "ground.height: 0 is above the bottom of the box, -0.5 along y"),
-    ([GROUND, "ground.albedo=1.1"], "ground.albedo: must be at most 1, found 1.1"),
-    ([GROUND, "ground.height=-0.55"], "'train_1' is not above it along y"),
-    (["volume.index=1.4", INSIDE], "volume.index: there is none with a camera inside"),
-]
-
-
-@pytest.mark.parametrize(("overrides", "problem"), FILES)
-def test_what_a_file_says_is_refused_in_one_line(overrides: list[str], problem: str) -> None:
-    with pytest.raises(SceneError, match=re.escape(problem)) as caught:
-        load_scene(BALL, overrides=["optimize=null", *overrides])
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("section", "values", "problem"),
-    [
-        ("diffusion", {"model": "P1"}, "model: expected one of none, p1, flux_limited, found"),
-        ("diffusion", {"degree": 4}, "degree: expected one of 1, 3, 5, 7, found 4"),
-        ("diffusion", {"tolerance": math.nan}, "tolerance: must be finite, found nan"),
-        ("diffusion", {"tolerance": "small"}, "tolerance: expected a number, found 'small'"),
-        ("render", {"samples_per_pixel": 0}, "samples_per_pixel: must be at least 1, found 0"),
-    ],
-)
-def test_a_setting_that_no_file_may_have_is_refused(
-    section: str, values: dict[str, Any], problem: str
-) -> None:
-    scene = scene_of({})
-    setattr(scene, section, replace(getattr(scene, section), **values))
-    with pytest.raises(UsageError, match=re.escape(f"{section}.{problem}")):
-        render(scene)
 
 
 def test_a_camera_below_a_ground_is_refused() -> None:

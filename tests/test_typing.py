@@ -8,13 +8,12 @@ import pytest
 from mypy import api
 
 import ddrecon
-from ddrecon import variables
 
 ROOT = Path(__file__).parents[1]
 RIGHT = """
 import torch
 import ddrecon
-from ddrecon.variables import value_of, variable_names, with_values
+from ddrecon.variables.values import value_of, variable_names, with_values
 scene = ddrecon.load_scene("a.yaml", overrides=["volume.g=0.3"], dtype=torch.float64)
 layer = ddrecon.VolumeRenderer(scene).to(torch.float32)
 def image(density: torch.Tensor) -> torch.Tensor:
@@ -35,7 +34,7 @@ ddrecon.rendre(scene)
 ddrecon.render("a.yaml")
 layer(density=2.0)
 layer(densities=torch.ones(3))
-variables.with_value(scene, {})
+values.with_value(scene, {})
 ddrecon.load_scene("a.yaml", overrides="a=b").volumes
 ddrecon.optimize(scene, "many")
 """
@@ -47,7 +46,7 @@ def test_a_type_checker_knows_right_from_wrong(
 ) -> None:
     monkeypatch.setenv("MYPYPATH", str(ROOT))
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "user.py").write_text(f"{RIGHT}from ddrecon import variables{WRONG}")
+    (tmp_path / "user.py").write_text(f"{RIGHT}from ddrecon.variables import values{WRONG}")
     told, problem, _ = api.run(["--strict", "--cache-dir", f"{ROOT}/.mypy_cache/user", "user.py"])
     wrong = range(RIGHT.count("\n") + 2, RIGHT.count("\n") + WRONG.count("\n") + 1)
     assert {int(line) for line in re.findall(r"^user\.py:(\d+): error", told, re.M)} == {*wrong}, (
@@ -58,8 +57,6 @@ def test_a_type_checker_knows_right_from_wrong(
 
 def test_what_it_knows_is_there() -> None:
     """The names that are imported for it alone, and those that are imported when first used."""
-    for module in (ddrecon, variables):
-        text = Path(module.__file__).read_text(encoding="utf-8")
-        names = re.findall(r"^    from \S+ import (\w+) as \1$", text, re.M)
-        assert len(names) > 2 and all(hasattr(module, name) for name in names)
-        assert {*names} == {*getattr(module, "_HOMES", names)}
+    text = Path(ddrecon.__file__).read_text(encoding="utf-8")
+    names = re.findall(r"^    from \S+ import (\w+) as \1$", text, re.M)
+    assert {*names} == {*ddrecon._HOMES} and all(hasattr(ddrecon, name) for name in names)

@@ -10,10 +10,7 @@ import numpy as np
 
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.field import EMPTY, Fields, prune
-from ddrecon.io.volumes.table import FORMATS, read_fields
-
-FILLED = f"more than {EMPTY:g} of the largest"
-"""How cells count as filled, in words."""
+from ddrecon.io.volumes.table import FORMATS, NANOVDB, read_fields
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -21,7 +18,7 @@ def describe(path: Path) -> dict[str, Any]:
 
     Raises FormatError when it is neither, or holds nothing that can be read.
     """
-    if path.suffix.lower() in FORMATS:
+    if path.suffix.lower() in (*FORMATS, NANOVDB):
         fields, reasons = read_fields(path)
         bounds = next((field.bounds for field in fields.values()), None)
         values = {name: field.values for name, field in fields.items()}
@@ -84,7 +81,7 @@ def lines(report: dict[str, Any]) -> list[str]:
     return [
         f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
         *(
-            f"{name}: {_values(of_field, FILLED, unit=of_field.get('unit', ''))}"
+            f"{name}: {_values(of_field, f'more than {EMPTY:g} of the largest')}"
             for name, of_field in report["fields"].items()
         ),
         *(
@@ -95,9 +92,9 @@ def lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _values(report: dict[str, Any], filled: str, about: str = "", unit: str = "") -> str:
+def _values(report: dict[str, Any], filled: str, about: str = "") -> str:
     """Whether values have colors, what else there is to say `about` them, and their range."""
-    numbers = f"{report['min']:.4g} to {report['max']:.4g}{unit and ' ' + unit}"
+    numbers = f"{report['min']:.4g} to {report['max']:.4g} {report.get('unit', '')}".rstrip()
     return (
         f"{'gray' if report['colors'] == 1 else 'RGB'}, {about}{numbers}, "
         f"mean {report['mean']:.4g}, {filled} in {100 * report['filled']:.3g} %"

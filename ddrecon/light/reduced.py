@@ -18,8 +18,7 @@ from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Poin
 from ddrecon.light.moments import add, moments_of_flux, weigh
 from ddrecon.light.pairs import ReversedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
-from ddrecon.light.profile import profile_in
-from ddrecon.light.refracted import RefractedBeam, enter_faces, refract_skies
+from ddrecon.light.profile import RefractedBeam, enter_faces, profile_in, refract_skies
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium, has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, recompute

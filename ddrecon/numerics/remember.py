@@ -82,7 +82,7 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
 
     def recall(*arguments: Any) -> Any:
         tensors = list[Tensor]()
-        key = function, *(_identify(argument, tensors) for argument in arguments)
+        key = function, *[_identify(argument, tensors) for argument in arguments]
         if not is_steady(*tensors):
             return function(*arguments)  # type: ignore[call-arg]
         result = memory.get(key)
@@ -112,10 +112,19 @@ def _identify(argument: Any, tensors: list[Tensor]) -> Any:
     if isinstance(argument, Tensor):
         tensors.append(argument)
         return (id(argument),)
-    if is_dataclass(argument) and type(argument).__eq__ is object.__eq__:
-        values = (getattr(argument, field.name) for field in fields(argument))
-        return type(argument), *(_identify(value, tensors) for value in values)
-    return argument
+    kind: Any = type(argument)
+    names = _fields_of(kind)
+    if names is None:
+        return argument
+    return kind, *[_identify(getattr(argument, name), tensors) for name in names]
+
+
+@functools.cache
+def _fields_of(kind: type) -> list[str] | None:
+    """The names of the fields of records that cannot be hashed by these."""
+    if is_dataclass(kind) and kind.__eq__ is object.__eq__:
+        return [field.name for field in fields(kind)]
+    return None
 
 
 def forget_changed() -> None:

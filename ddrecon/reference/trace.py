@@ -123,17 +123,14 @@ class Traced:
 
     def distance(self, image: np.ndarray) -> float:
         """The root mean square of the difference to `image`, relative to this one's."""
-        return math.sqrt(self._square(image))
+        return math.sqrt(((image - self.image) ** 2).mean() / _power(self.image))
 
     def error(self, image: np.ndarray) -> float:
         """The `distance` of `image` less the noise, in quadrature; at least 0.
 
         That is what would be left were this image free of noise.
         """
-        return math.sqrt(max(0.0, self._square(image) - self.noise**2))
-
-    def _square(self, image: np.ndarray) -> float:
-        return float(((image - self.image) ** 2).mean() / _power(self.image))
+        return math.sqrt(max(0.0, self.distance(image) ** 2 - self.noise**2))
 
 
 def least_error(noise: float) -> float:
@@ -251,22 +248,17 @@ def compare_to_folder(
                 ours = view_image(light_field, scene, view.camera).cpu()
             seconds["ours"] = perf_counter() - start
             theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
-            measured |= _measure(traced, ours, theirs)
+            image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
+            measured |= {
+                "error": traced.error(image),
+                "distance": traced.distance(image),
+                "psnr": float(Target.of(theirs, None).psnr_of(ours)),
+                "brightness": float(image.mean()) / mean if mean > 0 else None,
+            }
             written = _write(folder / view.name, ours, theirs)
         report["views"][view.name] = measured
         report["files"][view.name] = [path.name for path in written]
     return report
-
-
-def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
-    """How far `ours` [3, h, w] is from what was traced; `theirs` is the same image as a tensor."""
-    image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
-    return {
-        "error": traced.error(image),
-        "distance": traced.distance(image),
-        "psnr": float(Target.of(theirs, None).psnr_of(ours)),
-        "brightness": float(image.mean()) / mean if mean > 0 else None,
-    }
 
 
 def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:

@@ -41,15 +41,11 @@ FIELDS = ("density", "sigma_a", "sigma_s")
 
 @dataclass(frozen=True)
 class Shown:
-    """A field `name` [z, y, x] or [C, z, y, x], in a `frame` of a film.
-
-    `of` is `result` or `truth`; `white` is the value shown as white.
-    """
+    """A field `name` [z, y, x] or [C, z, y, x], of a `result` or a `truth`, in a film's `frame`."""
 
     name: str
     of: str
     values: Tensor
-    white: float
     frame: int | None = None
 
 
@@ -105,9 +101,14 @@ def describe_volume(
 ) -> dict[str, Any]:
     """The section of a page with the `fields` to turn and to cut, and `lines` about them.
 
-    `world` is what `describe_world` says; `shown` is the name of the field that is shown at first.
-    Where no scripts run, there are pictures of the results, of the last frame.
+    Fields of one name have one scale. `world` is what `describe_world` says; `shown` is the name of
+    the field that is shown at first. Where no scripts run, there are pictures of the results, of
+    the last frame.
     """
+    whites = dict[str, float]()
+    for field in fields:
+        white = find_white_value(field.values)
+        whites[field.name] = max(whites.get(field.name, 0.0), white)
     most = min(MOST_CELLS, MOST_OF_PAGE // max(1, len(fields)))
     last = [f for f in fields if f.of == "result" and f.frame == fields[-1].frame]
     return {
@@ -115,7 +116,7 @@ def describe_volume(
         "shown": shown,
         "stills": [_describe_still(field) for field in last],
         "world": world,
-        "fields": [_embed(field, most) for field in fields],
+        "fields": [_embed(field, whites[field.name], most) for field in fields],
     }
 
 
@@ -128,13 +129,16 @@ def _describe_still(field: Shown) -> dict[str, Any]:
     return {"name": field.name, "largest": largest, "slices": png_of(slices(values))}
 
 
-def _embed(field: Shown, most: int) -> dict[str, Any]:
-    """`field` for the scripts: as displayed, 8 bits, x fastest; means of blocks, `most` of them."""
+def _embed(field: Shown, white: float, most: int) -> dict[str, Any]:
+    """`field` for the scripts: as displayed, 8 bits, x fastest; means of blocks, `most` of them.
+
+    Values of `white` and more are white.
+    """
     values = field.values.detach().float()
     values = values if values.ndim == 4 else values[None]
     factor = math.ceil((values[0].numel() / most) ** (1 / 3))
     values = avg_pool3d(values, factor, ceil_mode=True, count_include_pad=False)
-    cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
+    cells = (values.permute(1, 2, 3, 0) / white).float().cpu().numpy()
     if is_signed := bool(cells.min() < 0):
         cells = diverge(cells.mean(-1))
     packed = gzip.compress(encode_bytes(cells).tobytes(), mtime=0)
@@ -143,7 +147,7 @@ def _embed(field: Shown, most: int) -> dict[str, Any]:
         "of": field.of,
         "size": list(values.shape[:0:-1]),
         "frame": field.frame,
-        "white": field.white,
+        "white": white,
         "signed": is_signed,
         "channels": cells.shape[-1],
         "data": base64.b64encode(packed).decode("ascii"),
@@ -167,12 +171,9 @@ def show(shown: Scene | Volume) -> Drawn:
     lights = f"; {len(scene.lights)} lights, {len(scene.views)} views" if scene else ""
     cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
     words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"
-    fields = {name: getattr(volume, name).detach() for name in FIELDS}
-    fields = {name: value for name, value in fields.items() if value.ndim >= 3}
-    viewed = [
-        Shown(name, "result", value, find_white_value(value)) for name, value in fields.items()
-    ]
-    volume_section = describe_volume(viewed, describe_world(volume.grid, scene))
+    fields = [Shown(name, "result", getattr(volume, name)) for name in FIELDS]
+    fields = [field for field in fields if field.values.ndim >= 3]
+    volume_section = describe_volume(fields, describe_world(volume.grid, scene))
     page = page_text(title="ddrecon", lead=words, volume=volume_section, is_small=True)
     return Drawn(
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '

@@ -1,4 +1,9 @@
-"""The reconstruction of a run, how good its pictures are, and what seems to be wrong with it."""
+"""The reconstruction of a run, how good its pictures are, and what seems to be wrong with it.
+
+A held-out camera may err as all do, and then says more of itself than of the volume. So views held
+out are registered as well: their pose and exposure are fitted to the finished volume, by Gauss and
+Newton with the slopes of where they were given, by differences: shifts are small.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +18,29 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, project
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
+from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import view_picture
 from ddrecon.pictures import COMPARED, LINEAR
+from ddrecon.progress import show_progress
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes, target_of
 from ddrecon.reconstruct.setup import choose_loss, targets_of
 from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings
-from ddrecon.variables.kinds import is_of_volume
-from ddrecon.variables.values import extinction_of, fields_of, value_of
+from ddrecon.variables.kinds import is_of_volume, pose_change
+from ddrecon.variables.values import extinction_of, fields_of, value_of, with_values
 
+STEPS = 8
+"""The most steps; they end when one improves nothing."""
+DAMPING = 1e-3
+"""Curvature added to all, as a part of the largest: what a picture does not show stays."""
+LARGEST_STEP = 40.0
+"""No step is farther than so many rates, of a quarter of a pixel."""
 OVERFIT = 6.0
 """Held-out views this much worse than those trained on [dB] are not explained by noise."""
 FACTOR = 1.15
@@ -45,7 +60,7 @@ class Findings:
     """The reconstructed `scene`, and the image and `quality` of each view with a target.
 
     `quality[view]` holds `split`, `psnr`, `ssim`; test views also have `fitted_exposure` or
-    `fitted_offset`. `truths` maps a field's name to the scene file's values where
+    `fitted_offset`, and `registered`. `truths` maps a field's name to the scene file's values where
     the run started from others: usually the ground truth.
     """
 
@@ -60,8 +75,8 @@ class Findings:
         return [view for view in self.scene.views if view.image is not None]
 
 
-def find_results(run: Reconstruction) -> Findings:
-    """The current result of `run`, rendered."""
+def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
+    """The current result of `run`, rendered; if it `is_last`, held-out views are registered."""
     scene, sizes = run.current_scene(), response_sizes(run.parameters)
     images, quality = dict[str, Tensor](), dict[str, dict[str, Any]]()
     findings = Findings(scene, _find_truths(run.problem.scene), images, quality)
@@ -69,18 +84,20 @@ def find_results(run: Reconstruction) -> Findings:
     targets = targets_of(compared, run.problem.loss, run.problem.noises)
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
-        for view in compared.views:
+        for view in show_progress(compared.views, "register") if is_last else compared.views:
             target, fitted = targets[view.name], dict[str, Tensor]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
                 picture, fitted = fit_held_out(picture, view, target, sizes)
             images[view.name] = picture
-            quality[view.name] = {
+            row = quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
+            if is_last and view.is_test:
+                row["registered"] = register(light_field, scene, view, target, sizes)
     return findings
 
 
@@ -110,6 +127,49 @@ def describe_loss(settings: OptimizeSettings, train: Scene) -> dict[str, Any]:
 def loss_text(described: Mapping[str, Any]) -> str:
     """What `describe_loss` says, as a line."""
     return f"loss: {described['loss_function']}, of {described['compared']}"
+
+
+def register(
+    light_field: LightField, scene: Scene, view: View, target: Target, sizes: Mapping[str, int]
+) -> dict[str, Any]:
+    """PSNR [dB] and SSIM of `view` registered to the volume of `scene`, lit by `light_field`.
+
+    And by how many pixels its smoke moved. `sizes` are as for `fit_held_out`.
+    """
+    name = f"views.{view.name}.camera"
+    unit = pose_change(scene, name, view.camera.pose)
+
+    def see_by(change: Tensor) -> tuple[View, Tensor]:
+        world = with_values(scene, {name: change})
+        moved = world.view(view.name)
+        return moved, view_picture(light_field, world, moved)
+
+    change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
+    moved, picture = see_by(change)
+    camera = moved.camera
+    offsets = (tuning.APART * unit).diag()
+    changes = torch.stack([see_by(offset)[1] - picture for offset in offsets]) / tuning.APART
+    for _ in range(STEPS):
+        fitted, response = fit_held_out(picture, view, target, sizes)
+        psnr = float(target.psnr_of(fitted))
+        if best and psnr <= best["psnr"]:
+            break
+        best, camera = {"psnr": psnr, "ssim": float(target.ssim_of(fitted))}, moved.camera
+        # Errors are those that PSNR counts, of values as they are compared.
+        exposure = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
+        slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / exposure
+        error = target.compared - target.on.values(fitted)
+        if target.seen is not None:
+            slope, error = slope * target.seen, error * target.seen
+        jacobian = (changes * slope).flatten(1).double().cpu()
+        residual = error.flatten().double().cpu()
+        matrix = jacobian @ jacobian.T
+        matrix = matrix + DAMPING * matrix.diagonal().max() * torch.eye(6).double()
+        step = torch.linalg.lstsq(matrix, jacobian @ residual).solution
+        step = step / (step.abs().max() / LARGEST_STEP).clamp(min=1)
+        change = change + step.to(unit) * unit
+        moved, picture = see_by(change)
+    return best | {"shift": shift_between(view.camera, camera, scene.volume)}
 
 
 def shift_between(camera: Camera, other_camera: Camera, volume: Volume) -> float:

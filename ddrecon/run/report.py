@@ -13,7 +13,6 @@ from statistics import median
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
 from ddrecon.pictures import encode_bytes
@@ -22,7 +21,7 @@ from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.page import Plot, draw_curve, write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
-from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
+from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.quality import Findings, shift_between
 from ddrecon.scene import Scene
 from ddrecon.terms import needed_terms
@@ -41,8 +40,6 @@ FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder
 """Why held-out views seem to get worse where the resolution changes."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
-Field = tuple[str, str, Tensor, int | None]
-"""A name, `result` or `truth`, values [..., z, y, x], and the frame of a film."""
 
 
 def write_run_report(
@@ -68,7 +65,7 @@ def write_run_report(
         share = 100 * (1 - summary["support"]["cells"])
         left_out = [f"Left out by the support: {share:.3g} % of the cells."]
     kinds = {"result": fields_of(scene), "truth": findings.truths}.items()
-    fields = [(name, of, value, None) for of, known in kinds for name, value in known.items()]
+    fields = [Shown(name, of, value) for of, known in kinds for name, value in known.items()]
     steps = [row for previous, row in pairwise(rows) if row.cells != previous.cells]
     at = ", ".join(str(row.iteration) for row in steps)
     finer = f"A line from top to bottom: the cells are finer from there ({at}). {FINER}."
@@ -81,7 +78,7 @@ def write_run_report(
         lead=lead,
         goes_on=summary["ended"]["kind"] == GOES_ON["kind"],
         doubts=[diagnosis["text"] for diagnosis in summary["diagnoses"]],
-        volume=describe_fields(scene, fields, left_out),
+        volume=describe_volume(fields, describe_world(scene.volume.grid, scene), left_out),
         plots={"heading": "Loss", "drawn": curves(rows, steps), "text": finer if steps else ""},
         views=_describe_views(findings),
         numbers=table if numbers else None,
@@ -128,21 +125,9 @@ def psnr_text(summary: Mapping[str, Any]) -> str:
     text = f"PSNR {summary['psnr']:.2f} dB"
     if summary.get("test_psnr") is not None:
         text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    if registered := summary.get("registered"):
+        text += f" (registered {_registered_text(registered)})"
     return text
-
-
-def describe_fields(
-    scene: Scene, fields: Sequence[Field], lines: Sequence[str] = (), shown: str = "density"
-) -> dict[str, Any]:
-    """The section of a page with `fields` on the grid of `scene`; those of one name have one scale.
-
-    There are `lines` about them, and the field called `shown` is seen first.
-    """
-    whites = dict[str, float]()
-    for name, _, values, _ in fields:
-        whites[name] = max(whites.get(name, 0.0), find_white_value(values))
-    scaled = [Shown(name, of, values, whites[name], frame) for name, of, values, frame in fields]
-    return describe_volume(scaled, describe_world(scene.volume.grid, scene), lines, shown)
 
 
 def curves(rows: Sequence[Row], steps: Sequence[Row] = ()) -> list[Plot]:
@@ -197,4 +182,11 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
         if f"fitted_{key}" in quality:
             values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
             text += f", {key} {values} fitted to it"
-    return text
+    registered = quality.get("registered")
+    return text + (f"; registered {_registered_text(registered)}" if registered else "")
+
+
+def _registered_text(registered: Mapping[str, float]) -> str:
+    """How good a view held out is by a camera fitted to the volume, and how far that moved."""
+    psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
+    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, smoke moved by {shift:.2f} pixels"

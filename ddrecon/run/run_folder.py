@@ -164,7 +164,7 @@ class Run(Iterations):
         """Writes volumes, parameters, result, pictures and report, and tells the summary."""
         assert self.path is not None
         run, path = self.run, self.path
-        findings = find_results(run)
+        findings = find_results(run, is_last=True)
         scene, support = findings.scene, run.problem.support
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
@@ -173,6 +173,9 @@ class Run(Iterations):
         write_json(path / "parameters.json", _list_parameters(path, scene, values))
         write_previews(path, findings, "")
         summary = self._summary() | {"views": findings.quality}
+        seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
+        if seen:
+            summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
         fall, doubt = (run.iteration, run.search.gain), summary.get("support", {}).get("doubt")
         summary["diagnoses"] = diagnose(findings, *fall, support, doubt)
         self._report(findings, summary)

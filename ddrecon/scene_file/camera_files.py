@@ -78,8 +78,6 @@ NUMBERS: Mapping[str, Mapping[str, float]] = {
 """What a camera says of its picture, and within which limits."""
 MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
 """What is refused, as it is not read, of a frame that says no focal length besides."""
-NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
-"""What lenses are called there."""
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
@@ -448,39 +446,28 @@ def export_transforms(
     require_free_files([path], may_exist=may_exist)
     frames, tests, folder = list[dict[str, Any]](), list[str](), path.absolute().parent
     for view, section in zip(scene.views, scene_file.tree.views, strict=True):
-        files = {"file_path": section.image, "mask_path": section.mask}
-        names = {
-            key: Path(os.path.relpath(file, folder)).as_posix()
-            for key, file in files.items()
-            if file is not None
-        }
-        frames.append(names | {"frame": section.frame, "time": section.time} | _camera(view))
-        tests += [names["file_path"]] if view.is_test and "file_path" in names else []
-    models = {frame["camera_model"] for frame in frames}
-    model = models.pop() if len(models) == 1 else "PINHOLE"
+        frame: dict[str, Any] = {"frame": section.frame, "time": section.time}
+        for key, file in (("file_path", section.image), ("mask_path", section.mask)):
+            if file is not None:
+                frame[key] = Path(os.path.relpath(file, folder)).as_posix()
+        frames.append(frame | _describe_camera(view))
+        tests += [frame["file_path"]] if view.is_test and "file_path" in frame else []
     lists = {TEST_LISTS[0]: tests} if tests else {}
-    write_json(path, {"camera_model": model, **lists, "frames": frames})
+    write_json(path, lists | {"frames": frames})
     return [path]
 
 
-def _camera(view: View) -> dict[str, Any]:
-    camera = view.camera
+def _describe_camera(view: View) -> dict[str, Any]:
+    camera, model, lens = view.camera, "PINHOLE", dict[str, float]()
     if not camera.is_perspective:
-        raise SceneError(
-            f"view {view.name!r}: an orthographic camera has no place in a transforms.json"
-        )
+        fault = "an orthographic camera has no place in a transforms.json"
+        raise SceneError(f"view {view.name!r}: {fault}")
+    if camera.lens is not None and camera.distortion is not None:
+        model = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}[camera.lens]
+        lens = dict(zip(LENSES[camera.lens], camera.distortion.tolist(), strict=True))
     (height, width), (x, y) = camera.size, camera.principal_point
     focal = width / 2 / float(camera.half_width)
-    intrinsics: dict[str, Any] = {
-        "camera_model": "PINHOLE",
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal / camera.pixel_aspect,
-        "cx": float(x) * width,
-        "cy": float(y) * height,
-    }
-    if camera.lens is not None and camera.distortion is not None:
-        coefficients = zip(LENSES[camera.lens], camera.distortion.tolist(), strict=True)
-        intrinsics |= {"camera_model": NAMES[camera.lens]} | dict(coefficients)
-    return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
+    focals = {"fl_x": focal, "fl_y": focal / camera.pixel_aspect}
+    pixels = {"w": width, "h": height, "cx": float(x) * width, "cy": float(y) * height}
+    pose = [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return {"camera_model": model, **pixels, **focals, **lens, "transform_matrix": pose}

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import yaml
 
 from ddrecon.errors import FormatError, Problems, SceneError, UsageError, suggestion
-from ddrecon.grid import Triple
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.records import Violation
@@ -132,12 +131,11 @@ def _scene_of(root: Node, path: Path) -> SceneFile:
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 
-def _up_of(root: Node) -> Triple:
-    """The unit vector along `volume.up`, of a scene that is not read yet."""
+def _up_of(root: Node) -> str:
+    """`volume.up` of a scene that is not read yet."""
     volume = root.entries().get("volume")
     entry = volume.value.get("up") if volume and isinstance(volume.value, dict) else None
-    up = entry.value if entry and entry.value in ("x", "z") else "y"
-    return float(up == "x"), float(up == "y"), float(up == "z")
+    return str(entry.value) if entry and entry.value in ("x", "z") else "y"
 
 
 def _text(path: Path) -> str:
@@ -248,11 +246,11 @@ def _violations(
 
 
 def views_of(
-    node: Node, source: ViewSource | tuple[ViewSection, ...], folder: Path, up: Triple
+    node: Node, source: ViewSource | tuple[ViewSection, ...], folder: Path, up: str
 ) -> tuple[ViewSection, ...]:
     """The named views that `source` lists or stands for, which `node` of a scene in `folder` says.
 
-    `up` points up in the scene.
+    The axis `up` points up in the scene.
     """
     if isinstance(source, tuple):
         return name_listed(node, source)
@@ -317,25 +315,21 @@ def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
 
-def ring_cameras(ring: RingSection, up: Triple) -> list[PerspectiveSection]:
+def ring_cameras(ring: RingSection, up: str) -> list[PerspectiveSection]:
     """Camera i of n stands at target + height u + r (cos(2 pi i/n) a + sin(2 pi i/n) u x a).
 
-    u is the unit vector along the ring's own `up` or this one, and a the axis after the one
-    nearest to it, made perpendicular.
+    u is the unit vector along the axis that is `up`, and a that of the axis after it.
     """
-    import numpy as np
-
-    upward = np.array(ring.up or up) / math.hypot(*(ring.up or up))
-    ahead = np.eye(3)[(np.abs(upward).argmax() + 1) % 3]
-    ahead = ahead - upward * (ahead @ upward)
-    ahead /= np.linalg.norm(ahead)
-    aside, cameras = np.cross(upward, ahead), []
+    upward, cameras = "xyz".index(up), list[PerspectiveSection]()
     for index in range(ring.count):
-        turn = 2 * math.pi * index / ring.count
-        outward = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
-        x, y, z = (np.array(ring.target) + ring.height * upward + outward).tolist()
+        turn, place = 2 * math.pi * index / ring.count, [*ring.target]
+        place[upward] += ring.height
+        place[(upward + 1) % 3] += ring.radius * math.cos(turn)
+        place[(upward + 2) % 3] += ring.radius * math.sin(turn)
         camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
-        cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=ring.up or up))
+        x, y, z = place
+        along = float(up == "x"), float(up == "y"), float(up == "z")
+        cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=along))
     return cameras
 
 

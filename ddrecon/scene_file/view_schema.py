@@ -181,15 +181,14 @@ def split_views(views: Sequence[ViewSection], test_every: int | None) -> list[Vi
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target`: where y is up, the first towards +z of it, the next towards +x.
-    Where z is up they are +x and +y.
+    """Cameras around `target` about `volume.up`: where y is up, the first towards +z of it, the
+    next towards +x. Where z is up they are +x and +y.
 
     count: How many.
     radius: Of the circle [u].
     fov: Horizontal field of view, in degrees.
-    height: Of the circle above the target, along `up` [u].
+    height: Of the circle above the target [u].
     target: What they look at [u].
-    up: What the circle lies around, and up in their images; `volume.up` unless given.
     resolution: Width and height in pixels; left out where there are images.
     """
 
@@ -198,7 +197,6 @@ class RingSection:
     fov: float = bounded(above=0, below=180)
     height: float = 0.0
     target: Triple = (0.0, 0.0, 0.0)
-    up: Triple | None = bounded(None, is_nonzero=True)
     resolution: Size | None = bounded(None, minimum=1, maximum=16384)
 
 

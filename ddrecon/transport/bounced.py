@@ -13,7 +13,7 @@ from torch import Tensor
 from ddrecon.grid import array_order
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.moments import add, beam_moments
-from ddrecon.light.refracted import RefractedBeam, enter_faces
+from ddrecon.light.profile import RefractedBeam, enter_faces
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.optics import reflectance

@@ -32,8 +32,8 @@ from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.report.page import write_page
+from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import Job, Outcome
-from ddrecon.run.report import describe_fields
 from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of, split_name
@@ -105,17 +105,14 @@ class Uncertainty(Job):
 
     @property
     def iteration(self) -> int:
-        """How many iterations have been made, of all experiments."""
         return self.count * self.run.iteration + (self.trial.iteration if self.trial else 0)
 
     @property
     def total(self) -> int:
-        """How many iterations there are at most."""
         return self.wanted * self.run.iteration
 
     @property
     def is_done(self) -> bool:
-        """Whether all experiments are made."""
         return self.count >= self.wanted
 
     def step(self) -> str:
@@ -140,13 +137,11 @@ class Uncertainty(Job):
                 self.truth[p.name] = truth if p.support is None else truth * p.support
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
         trial = None if self.trial is None else self.trial.state()
         names = "errors", "truth", "seconds"
         return {name: getattr(self, name) for name in names} | {"trial": trial}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up where `state` was."""
         like = next(iter(self.values.values()))
         self.seconds = state["seconds"]
         self.errors = [{n: e.to(like) for n, e in entries.items()} for entries in state["errors"]]
@@ -156,10 +151,8 @@ class Uncertainty(Job):
             self.trial.restore(state["trial"])
 
     def begin(self, folder: Folder, is_resumed: bool) -> None:
-        """Removes what earlier experiments have left in the folder, or `is_resumed`."""
         self.path = folder.path
-        if not is_resumed:
-            folder.clear()
+        super().begin(folder, is_resumed)
 
     def fields(self) -> dict[str, Field]:
         """The deviations of all fields and maps by the experiments so far, by name."""
@@ -167,10 +160,7 @@ class Uncertainty(Job):
 
     def numbers(self) -> dict[str, dict[str, float]]:
         """The value and the deviation of each number, and of the mass of each density, by name."""
-        numbers, tabled = (
-            dict[str, dict[str, float]](),
-            [p for p in self.parameters if is_tabled(p)],
-        )
+        numbers, tabled = dict[str, dict[str, float]](), [*filter(is_tabled, self.parameters)]
         for p in self.parameters:
             if split_name(p.name)[1] == "density" and not is_tabled(p):
                 cell = math.prod(p.grid.spacing)
@@ -182,10 +172,14 @@ class Uncertainty(Job):
             alike = [q for q in tabled if q.view is not None and q.key == p.key]
             names = [q.name for q in alike or [p]]
             stacked = [torch.stack([e[name].flatten() for name in names]) for e in self.errors]
-            for at, name in enumerate(_entry_names(p)):
+            value = p.value.detach()
+            entries = [p.name]
+            if value.numel() > 1:
+                components = component_names(p.name, value) or range(value.numel())
+                entries = [f"{p.name}.{component}" for component in components]
+            for at, name in enumerate(entries):
                 errors = [e[:, at] if alike else e.square().mean(1).sqrt() for e in stacked]
-                value = float(p.value.detach().flatten()[at])
-                numbers[name] = _with_deviation(value, torch.cat(errors))
+                numbers[name] = _with_deviation(float(value.flatten()[at]), torch.cat(errors))
         return numbers
 
     def finish(self) -> Outcome:
@@ -219,12 +213,13 @@ class Uncertainty(Job):
         }
         first = next(iter(volumes), "density")
         volumes = {name: value.cpu() for name, value in fields_of(scene).items()} | volumes
-        cells = [(name, "result", value, None) for name, value in volumes.items()]
+        cells = [Shown(name, "result", value) for name, value in volumes.items()]
+        world = describe_world(scene.volume.grid, scene)
         write_page(
             path / "report.html",
             title=f"ddrecon: how sure a run is ({path.absolute().name})",
             lead=f"{lead}.",
-            volume=describe_fields(scene, cells, lines, first),
+            volume=describe_volume(cells, world, lines, first),
             numbers={"heading": "Numbers", "head": ("", ""), "rows": rows, "text": ASSUMED},
         )
         return record, [lead, *lines, *(f"{name}: {text}" for name, text in rows), ASSUMED]
@@ -234,8 +229,12 @@ class Uncertainty(Job):
 
         They err as those of the run do, the other way around; of later ones, either way by view.
         """
-        problem = self.run.problem
-        pictures = photograph(bring_closer(self.run.level.train), self.truth)
+        problem, train = self.run.problem, self.run.level.train
+        diffusion = train.diffusion
+        if (diffusion.model, diffusion.scheme) == ("p1", "conservative"):
+            rounds = min(diffusion.rounds + MORE_ROUNDS, MOST_ROUNDS)
+            train = replace(train, diffusion=replace(diffusion, transport_rounds=rounds))
+        pictures = photograph(train, self.truth)
         generator = torch.Generator().manual_seed(self.seed % 2**31 + self.count)
         signs = torch.randint(0, 2, (len(pictures),), generator=generator) * 2 - 1
         views = list(problem.train.views)
@@ -261,15 +260,6 @@ def photograph(scene: Scene, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
             for view in scene.views
         ]
     return dict(zip(names, sum_over_ranks(pictures), strict=True))
-
-
-def bring_closer(scene: Scene) -> Scene:
-    """`scene` by more transport rounds, as far as its model has any."""
-    diffusion = scene.diffusion
-    if (diffusion.model, diffusion.scheme) != ("p1", "conservative"):
-        return scene
-    rounds = min(diffusion.rounds + MORE_ROUNDS, MOST_ROUNDS)
-    return replace(scene, diffusion=replace(diffusion, transport_rounds=rounds))
 
 
 def is_tabled(parameter: Parameter) -> bool:
@@ -344,12 +334,3 @@ def _with_deviation(value: float, errors: Tensor) -> dict[str, Any]:
     """A number with its deviation, by the `errors` of experiments: wider where there are few."""
     size = float(errors.double().square().mean().sqrt())
     return {"value": value, "deviation": RATIO * (1 + 2 / len(errors)) * size}
-
-
-def _entry_names(parameter: Parameter) -> Sequence[str]:
-    """The names of the entries of a `parameter` that is tabled."""
-    name, value = parameter.name, parameter.value
-    if value.numel() == 1:
-        return [name]
-    components = component_names(name, value) if value.ndim else ()
-    return [f"{name}.{component}" for component in components or range(value.numel())]

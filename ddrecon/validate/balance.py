@@ -25,8 +25,8 @@ from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import add, cut, fill, weigh
 from ddrecon.light.pairs import ReversedBeam
+from ddrecon.light.profile import enter_faces
 from ddrecon.light.reduced import ambient_radiance
-from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.light_field import fluence_of, multiply_scatters
 from ddrecon.lighting import solve_light

@@ -225,13 +225,10 @@ def _unknown(scene: Scene, name: str) -> UsageError:
     if near := nearest(name, [*names, *components]):
         return UsageError(f"no variable {name!r}{near}")
     names = [known for known in names if not known.startswith("views.")]
-    hints = [f"besides views, the scene has {', '.join(names)}"]
-    if scene.views:
-        view = scene.views[0]
-        hints.append(f"each view has {', '.join(_view_keys(view))}, as in views.{view.name}.camera")
+    hint = f"besides views, the scene has {', '.join(names)}"
     if name == "emission":
-        hints = ["a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"]
-    return UsageError(f"no variable {name!r}; {'; '.join(hints)}")
+        hint = "a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"
+    return UsageError(f"no variable {name!r}; {hint}")
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:

@@ -114,6 +114,7 @@ def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> N
     record = json.loads((out / "film.json").read_text())
     assert [row["frame"] for row in record["frames"]] == list(range(FRAMES))
     assert all(1 <= row["iterations"] <= 24 for row in record["frames"])
+    assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
     # Its page has the volume of each frame beside its pictures.
     page = (out / "report.html").read_text()
     data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)

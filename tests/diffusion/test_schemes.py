@@ -8,7 +8,6 @@ from collections.abc import Callable
 import pytest
 import torch
 from media import (
-    assert_derivatives,
     assert_image_derivatives,
     box_grid,
     convergence_order,
@@ -25,13 +24,12 @@ from ddrecon.diffusion.paper import (
     VACUUM,
     LimitedOperator,
     PrintedOperator,
-    convolve,
     extend,
     fill_ghosts,
     iterate_jacobi,
     iterate_picard,
     limit_diffusion,
-    make_stencils,
+    weigh_neighbors,
 )
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
@@ -49,20 +47,19 @@ SHAPES = [(3, 2, 4), (1, 2, 3), (1, 1, 1)]
 def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
     """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
     kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
-    stencils, squares = make_stencils(grid, kappa), sum(2 / h**2 for h in grid.spacing)
-    diagonal = 3 * random_values(colors, *grid.shape, seed=2) + kappa * squares
     echo, _ = fill_ghosts(grid, kappa, None, DARK)
-    weights = torch.cat([kappa[:, None], convolve(extend(kappa), stencils[1:])], 1)
-    return PrintedOperator(grid, stencils, tensors=(diagonal, weights, echo))
+    weights = weigh_neighbors(grid, kappa)
+    diagonal = 3 * random_values(colors, *grid.shape, seed=2) + weights.sum(1)
+    return PrintedOperator(tensors=(diagonal, weights, echo))
 
 
 def transposed(operator: PrintedOperator) -> PrintedOperator:
     return operator.linearized(torch.zeros_like(operator.tensors[0])).transposed()
 
 
-def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
+def matrix_by_loops(grid: Grid, kappa: Tensor, loss: Tensor) -> Tensor:
     """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin of the operator."""
-    grid, shape = operator.grid, operator.grid.shape
+    shape = grid.shape
     number = {cell: n for n, cell in enumerate(itertools.product(*map(range, shape)))}
     matrix = torch.zeros(len(number), len(number), dtype=kappa.dtype)
     for cell, row in number.items():
@@ -89,7 +86,7 @@ def matrix_of(operator: PrintedOperator) -> Tensor:
 def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, int]):
     operator = make_printed(box_grid(shape), contrast=30.0)
     kappa = 0.1 * 30.0 ** random_values(2, *shape, seed=1)[0]
-    expected = matrix_by_loops(operator, kappa, 3 * random_values(2, *shape, seed=2)[0])
+    expected = matrix_by_loops(box_grid(shape), kappa, 3 * random_values(2, *shape, seed=2)[0])
     torch.testing.assert_close(matrix_of(operator)[0], expected, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(
         matrix_of(transposed(operator))[0], expected.T, rtol=1e-12, atol=1e-12
@@ -212,11 +209,13 @@ def test_diffusion_falls_where_light_does_cell_by_cell():
     torch.testing.assert_close(limited, square**-0.5, rtol=1e-9, atol=0)
 
 
-def test_the_light_found_balances():
+def test_the_light_found_balances_and_is_found_again_at_once():
     grid = box_grid(SHAPE)
     source, *fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
-    u = solved(grid, SolveMemory(), 1e-13, source, *fields, outside)
+    memory = SolveMemory()
+    u, _ = (solved(grid, memory, 1e-13, source, *fields, outside) for _ in range(2))
+    assert memory.records[0].iterations > 1 >= memory.records[1].iterations
     residual = LimitedOperator(grid, tensors=(*fields, outside)).apply(u) - source
     assert float(residual.abs().max()) < 1e-11 * float(u.abs().max())
 
@@ -231,21 +230,6 @@ def test_dense_media_diffuse_as_without_a_limit(make):
     torch.testing.assert_close(ours, theirs, rtol=0.03, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_derivatives_agree_with_each_other_and_differences():
-    shape, weights = (2, 3, 2), random_values(1, 2, 3, 2, seed=7)
-    inputs = [4 * random_values(1, *shape, seed=seed) for seed in range(3)]
-    inputs[1] *= random_values(1, *shape, seed=9) > 0.5
-    flux = [random_values(1, *shape, seed=seed) for seed in (4, 5, 6)]
-    arguments = [*inputs, torch.full((1, 1, 1, 1), 0.5, dtype=torch.float64), *flux]
-
-    def total(values: dict[str, Tensor]) -> Tensor:
-        memory = SolveMemory(is_warm=False)
-        return (weights * solved(box_grid(shape), memory, 1e-14, *values.values())).sum()
-
-    assert_derivatives(total, {str(k): value for k, value in enumerate(arguments)}, 1e-6)
-
-
 @pytest.mark.parametrize(
     "lights", [{}, {"ambient": None}, {"ambient": None, "directional": None}], ids=str
 )
@@ -254,15 +238,6 @@ def test_an_empty_box_has_finite_derivatives(lights: dict[str, None], make):
     scene = with_values(make(density.detach(), **lights), {"density": density})
     (slope,) = torch.autograd.grad(render(scene).sum(), density)
     assert bool(slope.isfinite().all())
-
-
-def test_iterations_are_recorded_and_resumed(make):
-    scene, memory = make(), SolveMemory()
-    for _ in range(2):
-        render(scene, memory=memory)
-    first, second = memory.records
-    assert first.kind == second.kind == "forward" and first.iterations > 1 >= second.iterations
-    assert first.residual <= 1e-12
 
 
 def test_giving_up_says_what_may_help(make, monkeypatch: pytest.MonkeyPatch):

@@ -27,6 +27,7 @@ FORMS = {
     "flat voxels": ((20, 20, 20), (1, 1, 10)),
     "long voxels": ((20, 20, 20), (1, 10, 10)),
     "bricks": ((20, 20, 20), (1, 2, 4)),
+    "cubes": ((32, 32, 32), (1, 1, 1)),
 }
 TOLERANCES = {torch.float32: 1e-5, torch.float64: 1e-11}
 each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
@@ -128,14 +129,6 @@ def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch
     assert solve_by_multigrid(operator, source, None, 1e-6).iterations <= 15
 
 
-def test_iterations_do_not_grow_with_the_number_of_cells():
-    counts = [
-        solve_by_multigrid(uneven((n, n, n)), random_values(2, n, n, n), None, 1e-6).iterations
-        for n in (8, 16, 32)
-    ]
-    assert max(counts) <= counts[0] + 2 and max(counts) <= 15
-
-
 @each_dtype
 def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
     """Random in every cell they take more, but less than a third of conjugate gradients alone."""
@@ -179,11 +172,17 @@ def test_colors_do_not_mix_and_may_share_conductances(losses: int):
         torch.testing.assert_close(together[c : c + 1], alone, rtol=1e-8, atol=0)
 
 
-@pytest.mark.parametrize("is_fitting", [True, False])
-def test_a_useless_start_does_no_harm(is_fitting: bool):
-    """A guess that is worse than zero, or of another grid, is not used."""
+GUESSES = {
+    "far": 1e9 * random_values(2, 4, 5, 3),
+    "of another grid": random_values(2, 3, 3, 3),
+    "not finite": torch.full((2, 4, 5, 3), math.nan).double(),
+}
+
+
+@pytest.mark.parametrize("guess", GUESSES.values(), ids=GUESSES)
+def test_a_useless_start_does_no_harm(guess: Tensor):
+    """One that is worse than zero is not used."""
     operator, source = patchy_box((4, 5, 3)), random_values(2, 4, 5, 3, seed=3)
-    guess = 1e9 * random_values(*source.shape) if is_fitting else random_values(2, 3, 3, 3)
     warm, known = (solve_by_multigrid(operator, source, u, 1e-8).value for u in (guess, None))
     assert torch.equal(warm, known)
 
@@ -278,12 +277,3 @@ def test_a_second_solve_starts_from_the_first(is_warm: bool):
         solver("forward", Operator(tuple(faces), loss), source)
     assert memory.records[0].iterations > 0
     assert (memory.records[1].iterations == 0) == is_warm == (("forward", 0) in memory.last)
-
-
-@pytest.mark.parametrize("number", [0.0, 1e30, math.nan])
-def test_what_a_caller_does_to_a_solution_changes_no_later_one(number: float):
-    """A later solve begins from it only where that is nearer than zero."""
-    memory, arguments = SolveMemory(), inputs()
-    known = solving(memory)(*arguments).clone()
-    memory.last["forward", 0].fill_(number)
-    torch.testing.assert_close(solving(memory)(*arguments), known, rtol=1e-9, atol=0)

@@ -19,7 +19,6 @@ from media import (
 from torch import Tensor
 
 from ddrecon.diffusion.cells import average_cells
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.moments import beam_moments, flux_along_axes, weigh
@@ -27,7 +26,7 @@ from ddrecon.light.pairs import follow_pair
 from ddrecon.light.profile import profile_in
 from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_masses
-from ddrecon.lighting import fluence, solve_light
+from ddrecon.lighting import fluence
 from ddrecon.medium.coefficients import (
     Medium,
     Volume,
@@ -41,7 +40,6 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.validate.hard import balance_of
 
 SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
 
@@ -254,29 +252,6 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
         again = 1 / (1 - turns * reflected)
         passed, reflected = lets * again * passed, turns + lets**2 * reflected * again
     assert float(taken.sum()) == pytest.approx(IRRADIANCE * (1 - passed - reflected), rel=1e-12)
-
-
-@pytest.mark.parametrize("g", [-0.8, -0.4])
-def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
-    """E8.11's beams leave with F and G at the ends; the rest, the source of E2.4, is balanced."""
-    density = 0.2 + torch.rand(9, 1, 1, dtype=torch.float64)
-    scene = in_unit_box(density, g=g, transport_rounds=1, degree=3)
-    medium = scale_medium(scene.volume, 3)
-    pair = follow_pair(medium, scene.lights[0])
-    beams = 4 * math.pi * (pair.along + pair.against)
-    volume = medium.grid.extent[0] / 9
-    received = (medium.absorption.value * beams).sum() * volume
-    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium)[0]).sum()
-    # what leaves, by the closed form of E8.11 for all the depth
-    beta = float(backward_fraction(medium)) * 6.0 / 6.5
-    rate, depth = math.sqrt(1 - beta**2), 6.5 * float(density.mean())
-    turned, passed = beta / (1 + rate), math.exp(-rate * depth)
-    leaves = (1 - turned**2) * passed + turned * (1 - passed**2)
-    leaves = IRRADIANCE * leaves / (1 - (turned * passed) ** 2)
-    assert float(received + scattered) + leaves == pytest.approx(IRRADIANCE, rel=1e-12)
-    memory = SolveMemory()
-    solve_light(scene, memory)
-    assert balance_of(scene, memory.last["forward", 0]).energy < 1e-11
 
 
 def test_a_slanted_pair_in_an_even_box_takes_what_it_takes_of_each_ray() -> None:

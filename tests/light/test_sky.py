@@ -55,16 +55,21 @@ def banded(height: int, width: int) -> Tensor:
     return (1 + torch.sin(around)).expand(3, height, width) + uneven(height, width).clamp(max=1)
 
 
+def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
+    """The direction (x, y, z) of a pixel, from -z over +x around."""
+    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
+    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
+
+
 def hot_pixel(
     height: int, width: int, row: int, column: int
 ) -> tuple[EnvironmentLight, DirectionalLight]:
     """A map black but for one pixel, and the parallel light it is, by its solid angle."""
     radiance = torch.zeros(3, height, width, dtype=torch.float64)
     radiance[:, row, column] = torch.tensor([300.0, 200.0, 100.0])
-    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
-    solid_angle = math.sin(down) * math.pi / (height - 1) * 2 * math.pi / width
-    x, y, z = math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
-    sun = DirectionalLight(tensor(-x, -y, -z), radiance[:, row, column] * solid_angle)
+    solid_angle = math.sin(math.pi * row / (height - 1)) * math.pi / (height - 1)
+    power = radiance[:, row, column] * solid_angle * 2 * math.pi / width
+    sun = DirectionalLight(-tensor(*center(row, column, height, width)), power)
     return light_of(radiance), sun
 
 
@@ -206,12 +211,6 @@ def seen(light: EnvironmentLight, *direction: float) -> list[float]:
     """What is seen along one direction (x, y, z), of any length."""
     vector = torch.nn.functional.normalize(light.radiance.new_tensor(direction), dim=0)
     return environment_radiance(light, array_order(vector)[None])[:, 0].tolist()
-
-
-def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
-    """The direction (x, y, z) of a pixel, from -z over +x around."""
-    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
-    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)

@@ -1,5 +1,6 @@
-"""A scene in Mitsuba's words says the same as the scene; nothing here needs Mitsuba."""
+"""A scene in Mitsuba's words says the same as the scene; noise from passes. None needs Mitsuba."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from ddrecon.light.lights import (
 from ddrecon.medium.phase import Blend, HenyeyGreenstein, Tabulated, TwoLobe
 from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
-from ddrecon.reference.trace import pick_color
+from ddrecon.reference.trace import Traced, pick_color
 from ddrecon.scene import Scene
 
 SHAPE = (3, 4, 5)
@@ -189,3 +190,29 @@ def test_rays_of_which_only_some_start_inside_are_refused() -> None:
     camera = make_camera(eye=(0.1, 0.1, 0.2), half_width=1.0, is_perspective=False)
     with pytest.raises(SceneError, match="view 'view'"):
         described(make_scene(random_values(*SHAPE), camera=camera))
+
+
+TRUTH = 1 + np.arange(64 * 64 * 3).reshape(64, 64, 3) / 5000
+SIGMA, PASSES = 0.5, 8
+
+
+@pytest.fixture
+def traced() -> Traced:
+    random = np.random.default_rng(0)
+    return Traced.of([TRUTH + SIGMA * random.normal(size=TRUTH.shape) for _ in range(PASSES)])
+
+
+def test_noise_is_that_of_the_mean(traced: Traced) -> None:
+    assert traced.noise == pytest.approx(SIGMA / math.sqrt(PASSES * (TRUTH**2).mean()), rel=0.03)
+
+
+def test_an_error_is_told_through_noise(traced: Traced) -> None:
+    assert traced.distance(1.1 * TRUTH) > 0.1
+    assert traced.error(1.1 * TRUTH) == pytest.approx(0.1, rel=0.05)
+    assert traced.error(TRUTH) < 0.3 * traced.noise
+    assert traced.error(traced.image) == 0
+
+
+def test_a_black_image() -> None:
+    black = Traced.of([np.zeros((2, 2, 3))] * 4)
+    assert (black.noise, black.error(np.zeros((2, 2, 3)))) == (0, 0)

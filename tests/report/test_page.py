@@ -68,7 +68,7 @@ class Balance(HTMLParser):
 @pytest.fixture
 def facts() -> dict[str, Any]:
     """A page of every section, whose texts are `NASTY`."""
-    shown = Shown(NASTY, "result", torch.ones(1, 1, 1), 1.0)
+    shown = Shown(NASTY, "result", torch.ones(1, 1, 1))
     plots = [draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
     table = {"heading": NASTY, "head": [NASTY], "rows": [[NASTY]], "text": NASTY}
     return {
@@ -157,12 +157,19 @@ def embedded(*fields: Shown) -> list[dict]:
 
 @pytest.mark.parametrize("colors", [(), (3,)])
 def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None:
-    """x fastest, in 8 bits of sRGB, at most half a step of it off; above white it is white."""
+    """x fastest, in 8 bits of sRGB, at most half a step of it off; above white it is white.
+
+    A field beside it of the same name, and half as large, has the same scale.
+    """
     values = torch.rand(*colors, 3, 4, 5, generator=torch.Generator().manual_seed(0)) * 2
-    (found,) = embedded(Shown("albedo", "truth", values, white=1.5))
+    values.flatten()[7] = 9  # one cell of a thousand, or nearly
+    fields = [Shown("albedo", of, v) for of, v in (("result", values / 2), ("truth", values))]
+    half, found = embedded(*fields)
+    white = find_white_value(values)
+    assert half["white"] == found["white"] == white < 9
     assert (found["name"], found["of"], found["size"]) == ("albedo", "truth", [5, 4, 3])
     cells = values.permute(1, 2, 3, 0) if colors else values[..., None]
-    expected = 255 * encode(np.clip(cells.numpy() / 1.5, 0, 1))
+    expected = 255 * encode(np.clip(cells.numpy() / white, 0, 1))
     assert np.abs(found["cells"] - expected).max() <= 0.501
 
 
@@ -170,16 +177,16 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
     """By means of blocks, those at the far ends of what is left over."""
     monkeypatch.setattr(volumes, "MOST_CELLS", 20)
     values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
-    (found,) = embedded(Shown("density", "result", values, white=1.0))
+    (found,) = embedded(Shown("density", "result", values))
     assert found["size"] == [3, 2, 3]
-    expected = 255 * encode(float(values[4:, 2:, 2:4].mean()))
+    expected = 255 * encode(float(values[4:, 2:, 2:4].mean()) / find_white_value(values))
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
 
 
 def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
     """Blue below, red above, as strong as far from zero: in pages and in pictures alike."""
     values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
-    (found,) = embedded(Shown("g", "result", values, find_white_value(values)))
+    (found,) = embedded(Shown("g", "result", values))
     page = found["cells"][0, 0].astype(float)
     picture = encode_bytes(slices(values)[0, :5]).astype(float)
     for blue, light_blue, white, light_red, red in (page, picture):
@@ -230,9 +237,9 @@ def test_pages_read_out_what_a_cell_holds() -> None:
     """Within half a step of the eight bits that they have, of signed fields as well."""
     row, signed = torch.linspace(0, 2, 9), torch.linspace(-0.6, 0.6, 9)
     fields = [
-        Shown("density", "result", row.view(1, 1, 9), 2.0),
-        Shown("albedo", "result", torch.stack([row, row / 2, row / 4]).view(3, 1, 1, 9), 2.0),
-        Shown("g", "result", signed.view(1, 1, 9), 0.6),
+        Shown("density", "result", row.view(1, 1, 9)),
+        Shown("albedo", "result", torch.stack([row, row / 2, row / 4]).view(3, 1, 1, 9)),
+        Shown("g", "result", signed.view(1, 1, 9)),
     ]
     contents = embedded(*fields)
     for content in contents:

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from media import box_grid, make_camera
+from media import box_grid, make_camera, random_values
 from media import make_scene as plain_scene
 
 from ddrecon.cameras import project, twist
+from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.picture import render
+from ddrecon.lighting import solve_light
+from ddrecon.losses import Target
+from ddrecon.picture import render, view_picture
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support
 from ddrecon.run.quality import (
@@ -23,6 +26,7 @@ from ddrecon.run.quality import (
     find_odd,
     find_results,
     find_unfinished,
+    register,
     shift_between,
 )
 from ddrecon.scene import Scene, View
@@ -222,6 +226,26 @@ def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
     texts = " ".join(find_odd(views, images, 0.0).values())
     found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", texts))
     assert found == told
+
+
+@pytest.mark.parametrize("loss", ["l2", "display"])
+def test_a_camera_that_is_off_is_found(loss: str) -> None:
+    camera = make_camera(size=(40, 40), half_width=0.28)
+    density = torch.nn.functional.avg_pool3d(random_values(1, 16, 16, 16), 5, 2)[0]
+    scene = plain_scene(density, camera=camera, sigma_a=(2.0,), sigma_s=(3.0,))
+    change = torch.tensor([0.02, -0.03, 0.01, 0.015, -0.02, 0.02]).double()
+    moved = twist(camera, change, scene.volume.grid.center_xyz)
+    with torch.no_grad():
+        lit = solve_light(scene, SolveMemory())
+        image = 0.8 * view_picture(lit, scene, replace(scene.views[0], camera=moved))
+        view = replace(scene.views[0], image=image, is_test=True)
+        scene = replace(scene, views=[view])
+        target = Target.of(image, None, loss)
+        as_is = target.psnr_of(view_picture(lit, scene, view))
+        found = register(lit, scene, view, target, {})
+    assert found["psnr"] > as_is + 15
+    true = shift_between(camera, moved, scene.volume)
+    assert true > 0.5 and abs(found["shift"] - true) < 0.15 * true
 
 
 def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell() -> None:

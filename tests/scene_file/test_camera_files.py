@@ -267,9 +267,8 @@ def test_a_film_begins_at_its_time(read: Read, views: Any, tmp_path: Path) -> No
     timed = views(frame("a.mp4", time=0.5), frame("b.png", time=0.5), **NERFSTUDIO)
     assert [view.time for view in timed] == [0.5, 0.0]
     empty = read(transforms(tmp_path / "t.json", frame(None), frame(None), **NERFSTUDIO))
-    scene = load_scene(tmp_path / "scene.yaml", dtype=torch.float64)
     whole = replace(empty, tree=replace(empty.tree, views=timed))
-    export_transforms(scene, whole, tmp_path / "again.json", may_exist=False)
+    export_transforms(build_scene(empty), whole, tmp_path / "again.json", may_exist=False)
     first = json.loads((tmp_path / "again.json").read_text())["frames"][0]
     assert (first["time"], first["file_path"]) == (0.5, "a.mp4")
 
@@ -284,12 +283,14 @@ def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
     camera |= {"principal_point": [0.4, 0.55], "resolution": [8, 6]}
     front = {"name": "a", "image": "images/a.npy", "mask": "images/b.npy", "camera": camera}
     side = {"name": "b", "image": "images/b.npy", "split": "test", "camera": camera | {"fov": 40}}
+    side |= {"frame": 3}
     scene_file = read(json.dumps(yaml.safe_load(SCENE) | {"views": [front, side]}))
     before, path = build_scene(scene_file, dtype=torch.float64), tmp_path / "out/transforms.json"
     assert export_transforms(before, scene_file, path, may_exist=False) == [path]
     again = read(changed(views={"transforms": "out/transforms.json"}))
     for old, new in zip(scene_file.tree.views, again.tree.views, strict=True):
         assert new.image is not None and (old.name, old.split) == (new.name, new.split)
+        assert (old.frame, old.time) == (new.frame, new.time)
         assert new.image.resolve() == old.image
         assert (new.mask and new.mask.resolve()) == old.mask
     for old, new in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):

@@ -14,6 +14,7 @@ BOX = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
 MEDIA = "volume={bounds: {min: [0, 0, 0], max: [1, 1, 1]}, resolution: [1, 1, 1], media: "
 MEDIUM = "{density: 1, sigma_t: 1, albedo: 1}"
 FLAT = "views.0.camera={type: orthographic, width: 2, resolution: [4, 4], matrix: "
+INSIDE = "& views.0.camera.origin=[0, 0.1, 0.2]"
 RING = "views={ring: {count: 3, radius: 3, fov: 30, resolution: [8, 6]}"
 """What rows of the table begin with, which close the brace themselves."""
 
@@ -47,6 +48,11 @@ volume.bounds.max=[0.5, -0.75, 1] => volume.bounds.max: -0.75 along y is not abo
 volume.density={{file: wide.npz}} => has the resolution 3 x 2 x 2, but volume.resolution has
 volume.density={{file: moved.npz}} => density.file: has the bounds (-1, -1.5, -1) to (1, 1.5, 1)
 volume=3 => volume: expected a mapping, found 3
+volume.periodic=[x,x] => volume.periodic: name one axis or two
+volume.periodic=[w] => volume.periodic.0: expected one of x, y, z
+ground={{height: 0, albedo: 0.3}} => ground.height: 0 is above the bottom of the box, -0.75 along y
+ground={{height: -2, albedo: 1.1}} => ground.albedo: must be at most 1, found 1.1
+volume.index=1.4 {INSIDE} => volume.index: there is none with a camera inside
 volume.phase={{type: rayleigh}} => volume.phase: g is short for a phase function: give only one
 volume={{density: 1, sigma_t: {{meters: 1}}, albedo: 1}} => volume.sigma_t: meters are for droplets
 volume.effective_radius=1 => volume.effective_radius: is that of droplets, phase: {{type: mie, ...}}
@@ -176,7 +182,7 @@ def rows(table: str) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("override", "line"), rows(SCENES))
 def test_what_is_wrong_with_a_scene(folder: Path, override: str, line: str) -> None:
-    overrides = [override]
+    overrides = override.split(" & ")
     if override.startswith("optimize.") and not override.startswith("optimize.parameters={"):
         overrides.insert(0, "optimize={parameters: {density: {}}}")
     with pytest.raises(SceneError) as caught:

@@ -82,13 +82,6 @@ def write_json(path: Path, content: Any) -> None:
     write_bytes(path, f"{json.dumps(content, indent=1)}\n".encode())
 
 
-def remove_temporaries(folder: Path) -> None:
-    """Removes what processes that were killed while writing have left in `folder`."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if is_temporary(path):
-            path.unlink(missing_ok=True)
-
-
 def is_temporary(path: Path) -> bool:
     """Whether `path` is named as what `replace_file` gives a block to write to."""
     return _TEMPORARY.fullmatch(path.name) is not None

@@ -23,7 +23,6 @@ from ddrecon.io.files.atomic import (
     is_temporary,
     note_written,
     refusals,
-    remove_temporaries,
     write_bytes,
 )
 
@@ -149,7 +148,8 @@ def claim_folder(
             folder = Folder(path, kind)
             folder.require(overwrite, resume)
             for place in (path, *folder.places()):
-                remove_temporaries(place)
+                for file in filter(is_temporary, place.iterdir()):  # of processes that were killed
+                    file.unlink(missing_ok=True)
             with refusals(path):
                 note_written(path, "/")
             claimed[key], is_new = folder.note, kind_of_folder(path) is None

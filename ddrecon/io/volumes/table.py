@@ -109,6 +109,8 @@ FORMATS: dict[str, VolumeFormat] = {
     ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
+NANOVDB = ".nvdb"
+"""A suffix that is known and not read."""
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
 """The suffixes of formats that are written."""
 
@@ -116,7 +118,8 @@ WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
 def _format_of(path: Path) -> VolumeFormat:
     if (suffix := path.suffix.lower()) not in FORMATS:
         suffixes = ", ".join(FORMATS)
-        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {suffixes}")
+        advice = f"; try nanovdb_convert {path.name} {path.stem}.vdb" if suffix == NANOVDB else ""
+        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {suffixes}{advice}")
     return FORMATS[suffix]
 
 

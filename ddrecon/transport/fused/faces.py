@@ -72,7 +72,7 @@ def _follow_chunk(
     courses: list[Characteristic],
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
-    """Radiance in cells along the ordinates of a chunk, and what leaves along each if any enters."""
+    """Radiance in cells along a chunk's ordinates, and what leaves along each if any enters."""
     if ends is None and not any(course.wraps[0] for course in courses):
         return sweep_ordinates(of, fields)[0], []
     extinction, emitted, gradient = fields

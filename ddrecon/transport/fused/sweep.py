@@ -3,7 +3,8 @@
 By rows, on a processor, a launch does some planes of a chunk of ordinates, with each team once
 along z and once against it. They meet in the middle, where each goes on in the next launch: so no
 two write to the same cells at once. By cells, on a GPU and where light enters by faces, a launch
-does one slice of all ordinates of a chunk, and products of matrices sum over moments and over these.
+does one slice of all ordinates of a chunk, and products of matrices sum over moments and
+ordinates.
 """
 
 from __future__ import annotations
@@ -194,7 +195,7 @@ class _ByCells(_Launches):
     """A chunk of ordinates, of which light may enter cells from outside: a ring like light."""
 
     def follow(self, entering: Tensor | None, _: bool = False) -> tuple[Tensor, Tensor]:
-        """Means of radiance [ordinates, C, z, y, x], or their change; and light that leaves cells."""
+        """Means of radiance [ordinates, C, z, y, x], or their change; and what leaves cells."""
         chunk, colors = self._all()
         # Planes behind the grid and, at the end of the ring, before it.
         light, means = self.ring(chunk, colors, self.grid.shape[0] + 2), self._outputs(1)

@@ -108,16 +108,6 @@ def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str, off: fl
     assert np.allclose(found, decode(stored / 255), atol=off)
 
 
-def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
-    stored = np.full((1, 3, 4), 255, np.uint8)
-    stored[0, :, 3] = 0, 51, 255
-    iio.imwrite(tmp_path / "a.png", stored)
-    image = read_image(tmp_path / "a.png")
-    assert image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1])
-    assert image.coverage is not None
-    assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
-
-
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8)}
 
 
@@ -151,28 +141,6 @@ def test_transparent_colors_of_png_are_alpha(tmp_path: Path, kind: int, depth: i
     else:
         colors = decode(colors)
     assert np.allclose(image.pixels, np.broadcast_to(colors, (5, 7, 3)), atol=1e-6)
-
-
-def test_gray_with_alpha_is_read(tmp_path: Path):
-    Pillow.new("LA", (3, 2), (255, 51)).save(tmp_path / "a.png")
-    assert np.allclose(read_image(tmp_path / "a.png").pixels, 0.2)
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_all_sixteen_bits_are_kept(tmp_path: Path, channels: int):
-    """By a tenth of the step between values of 8 bits."""
-    stored = np.random.default_rng(channels).integers(0, 2**16, (7, 5, channels), np.uint16)
-    module = pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
-    spec = module.ImageSpec(5, 7, channels, "uint16")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    file = module.ImageOutput.create("a.png")
-    assert file.open(str(tmp_path / "a.png"), spec) and file.write_image(stored) and file.close()
-    image, has_alpha = read_image(tmp_path / "a.png"), channels % 2 == 0
-    linear = decode(stored[..., : channels - has_alpha] / 65535)
-    alpha = stored[..., -1:] / 65535 if has_alpha else np.ones(1)
-    np.testing.assert_allclose(image.pixels, np.broadcast_to(linear * alpha, (7, 5, 3)), atol=1e-6)
-    assert image.step == 1 / 65535 and (image.coverage is not None) == has_alpha
-    assert not has_alpha or np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
 
 
 def save_mask(path: Path, inside: np.ndarray, mode: str) -> np.ndarray:

@@ -13,8 +13,8 @@ from refusals import refusal
 from vdb_files import Grid, Tile, write_file
 
 from ddrecon.errors import DataWarning, FormatError
+from ddrecon.io.volumes.blosc import unpack_blosc, unpack_lz4
 from ddrecon.io.volumes.table import read_field
-from ddrecon.io.volumes.vdb_tree import unpack_blosc, unpack_lz4
 
 NONE, ZIP, MASK, BLOSC = 0, 1, 2, 4
 QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=20)

@@ -9,6 +9,7 @@ import pytest
 from refusals import refusal
 
 from ddrecon.errors import FormatError
+from ddrecon.io.info import describe
 from ddrecon.io.volumes.table import read_field, write_field
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
@@ -61,6 +62,12 @@ def test_what_is_no_field_is_refused_with_advice(
 ) -> None:
     np.savez(tmp_path / "f.npz", **arrays)
     assert told in refusal(tmp_path / "f.npz")
+
+
+def test_nanovdb_is_refused_with_what_converts_it(tmp_path: Path) -> None:
+    path = tmp_path / "smoke.nvdb"
+    with pytest.raises(FormatError, match=r"try nanovdb_convert smoke\.nvdb"):
+        describe(path)
 
 
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)

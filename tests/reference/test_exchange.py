@@ -1,6 +1,8 @@
-"""What is imported from Mitsuba is what was exported to it."""
+"""Exported scenes are those that Mitsuba is given directly, and come back as they were."""
 
 import re
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -9,10 +11,13 @@ import pytest
 import torch
 from media import make_camera, make_scene, random_values
 
-from ddrecon.errors import DataWarning, FormatError
+from ddrecon.errors import DataWarning, FormatError, UsageError
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.exchange import export_scene, import_scene
+from ddrecon.reference.trace import open_tracer
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import cross_sections
@@ -22,6 +27,7 @@ pytestmark = pytest.mark.slow
 
 COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 SUN = DirectionalLight(-COLOR, COLOR)
+NEAR: list[Light] = [SUN, PointLight(COLOR, 2 * COLOR), AmbientLight(COLOR)]
 
 
 def sky(up: str) -> EnvironmentLight:
@@ -145,3 +151,56 @@ def test_a_shape_without_a_medium_is_left_out_with_a_warning(tmp_path: Path) -> 
     path.write_text(path.read_text().replace("</scene>", ball))
     with pytest.warns(DataWarning, match="left out: 1 shapes without a medium"):
         import_scene(path, tmp_path / "again.yaml", may_exist=False)
+
+
+OPEN = """
+import sys
+import numpy as np
+from ddrecon.reference.trace import load_mitsuba
+mitsuba = load_mitsuba(threads=2)
+path, paths, seed = sys.argv[1:]
+scene = mitsuba.load_file(path)
+image = mitsuba.render(scene, spp=int(paths), seed=int(seed))
+np.save(path + ".npy", np.array(image, np.float64))
+"""
+
+
+def opened(path: Path, paths: int, seed: int) -> np.ndarray:
+    """The scene as a user's Mitsuba shows it by so many paths a pixel.
+
+    In a process of its own, since after other scenes Mitsuba's EXR reader has hung.
+
+    On two threads, as the tracer: random numbers of `scalar_rgb` depend on how many there are.
+    """
+    command = [sys.executable, "-c", OPEN, *map(str, (path, paths, seed))]
+    subprocess.run(command, check=True, timeout=120)
+    return np.load(f"{path}.npy")
+
+
+@pytest.mark.parametrize("with_sky", [False, True])
+def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
+    """Through a camera of either kind, by each light, over a ground with and without a map."""
+    lights, reflected = NEAR, COLOR / 4
+    if with_sky:
+        pytest.importorskip("OpenImageIO")
+        lights, reflected = [*NEAR, sky("y")], random_values(3, 4, 2)
+    camera = make_camera(eye=(2.0, 0.5, 0.1), is_perspective=with_sky, half_width=0.6)
+    scene = make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
+    ground = Ground(reflected, Plane(-0.7, 1))
+    scene = replace(scene, lights=lights, views=[View("other", camera)], ground=ground)
+    export_scene(scene, tmp_path / "scene.xml", may_exist=False)
+    np.testing.assert_allclose(
+        opened(tmp_path / "scene.xml", 16, 5),
+        open_tracer(scene, scene.views, threads=2).trace(0, 5, 16),
+        rtol=1e-4,
+    )
+
+
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    scene, path = make_scene(random_values(3, 4, 5)), tmp_path / "scene.xml"
+    (tmp_path / "scene.sigma_t.vol").write_text("mine")
+    with pytest.raises(UsageError, match=r"scene.sigma_t.vol: already there"):
+        export_scene(scene, path, may_exist=False)
+    assert (tmp_path / "scene.sigma_t.vol").read_text() == "mine" and not path.exists()
+    export_scene(scene, path, may_exist=True)
+    assert read_field(tmp_path / "scene.sigma_t.vol", "sigma_t").resolution == (5, 4, 3)
