@@ -31,6 +31,7 @@ from speed import start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from ddrecon.bench import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError, SceneError, UsageError
@@ -41,7 +42,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.validate.hard import plume_scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 ROOT = Path(__file__).parents[1]

@@ -34,12 +34,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ddrecon
+from ddrecon.bench import plume_scene
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.validate.hard import plume_scene
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(ddrecon.__file__).parent

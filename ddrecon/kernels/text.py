@@ -136,11 +136,12 @@ class TextKernel:
         arrays = list[Tensor]()
         for name, value in values.items():
             is_list = name in self.lists
-            entries = zip(self.lists[name], value, strict=True) if is_list else [(name, value)]
+            entries = zip(self.lists[name], value, strict=True) if is_list else ((name, value),)
             for entry, number in entries:
                 if isinstance(number, Tensor):
-                    if name not in self.written:
-                        number = number.to(self.arrays.get(entry)).contiguous()
+                    dtype, is_plain = self.arrays.get(entry), number.is_contiguous()
+                    if name not in self.written and not (is_plain and number.dtype is dtype):
+                        number = number.to(dtype).contiguous()
                     arrays.append(number)
                 self.write(record, entry, number)
         return arrays

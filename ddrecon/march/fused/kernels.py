@@ -12,7 +12,7 @@ import torch
 from ddrecon.kernels.text import TextKernel, members_of, names_of
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.phase_peak import count_powers, is_scaled
+from ddrecon.medium.phase import count_powers, is_scaled
 
 _CHANGES = "F *d_rays, *d_angles, *d_numbers, *d_table, *d_fronts"
 
