@@ -39,6 +39,9 @@ FLAT, BACKWARD = 0.5, 0.2
 """A medium is flat if its density on a face of the box exceeds `FLAT` times its mean: light leaves
 on one side of a plane, which takes degree 5. A backward peak of more than `BACKWARD` of scattering
 takes it as well. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md)."""
+MOST_EXCHANGES, LEFT_OUT = 4, 2e-3
+"""Light goes to and fro between a ground and a volume that repeats until at most this part of it is
+left out, by so many exchanges at most. Of another volume so much leaves sideways that one does."""
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
 
@@ -174,6 +177,21 @@ def find_occupied(
 
     z, y, x = ends(0), ends(1), ends(2)
     return (z[0], y[0], x[0]), (z[1], y[1], x[1])
+
+
+def choose_exchanges(ground: Ground, is_periodic: bool, optimized: Collection[str]) -> int:
+    """How often light goes to and fro between `ground` and a volume (E5.4).
+
+    A layer that reflects the part R of light from below and passes the rest lacks A^(n+1) R^n (1-R)
+    after n exchanges over an albedo A, most where R is n/(n+1).
+    """
+    albedo = 1.0 if "ground.albedo" in optimized else float(ground.mean_albedo.max())
+    count = 1
+    while is_periodic and count < MOST_EXCHANGES:
+        if albedo ** (count + 1) * count**count / (count + 1) ** (count + 1) <= LEFT_OUT:
+            break
+        count += 1
+    return count
 
 
 def _is_flat(media: Iterable[Volume]) -> bool:

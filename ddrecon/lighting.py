@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.cameras import Rays
+from ddrecon.defaults import MOST_EXCHANGES
 from ddrecon.diffusion.cells import average_cells, sharpen
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Cells, Grid
@@ -26,16 +27,14 @@ from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.medium.coefficients import Medium, resample, volume_at_level
 from ddrecon.medium.optics import transmitted_moments
 from ddrecon.numerics.autodiff import recompute
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import Unrolled
+from ddrecon.numerics.sphere import harmonics
 from ddrecon.scene import Scene, require_supported
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
 BESIDE = 1
 """Cells of the volume's grid beyond its medium, where light does so."""
-EXCHANGES = 4
-"""How often it does where the volume repeats, and so little of it leaves sideways."""
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
@@ -55,7 +54,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     ambient = ambient_radiance(sources, thin.g).flatten()
     from_below = light_from_below(average_cells(thin), plane, ambient)
     lit = light_evenly(ground, sources, thin.grid, ambient)
-    for _ in range(EXCHANGES if thin.grid.periodic else 1):
+    for _ in range(scene.exchanges or (MOST_EXCHANGES if thin.grid.periodic else 1)):
         up = from_below(*reflect(lit, thin, scene.render))
         first = find_light(thin, sources, replace(settings, refine=1), replace(memory, last={}), up)
         down = partial(send_down, first, plane, multiply_scatters(thin, settings))

@@ -17,14 +17,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, rotation
-from ddrecon.defaults import choose_diffusion, find_occupied
+from ddrecon.defaults import choose_diffusion, choose_exchanges, find_occupied
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import BeamLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures import Noise
 from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
@@ -38,7 +37,7 @@ class View:
 
     What its camera does to radiance (E9.1): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
     0; `background` [C, h, w] or [C, 1, 1] is what the picture shows where the volume is empty, None
-    for the light behind it. `step` and `noise` say how the picture errs, see `ddrecon.pictures`.
+    for the light behind it. `step` says how the picture errs, see `ddrecon.pictures`.
     """
 
     name: str
@@ -51,7 +50,6 @@ class View:
     offset: Tensor | None = None
     background: Tensor | None = None
     step: float = bounded(0.0, minimum=0)
-    noise: Noise | None = None
 
     @property
     def seen(self) -> Tensor:
@@ -67,8 +65,9 @@ class Scene:
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from; `ground` lies under the volume, where there is any. What
     `render` and `diffusion` leave out is chosen by the medium when the scene is made, and stays
-    when the medium changes. So does `occupied`, where there is a ground: where the part of the box
-    begins and ends, along z, y and x from 0 to 1, that has any medium. `reason`: which settings of
+    when the medium changes. So do `occupied` and `exchanges`, where there is a ground: where the
+    part of the box begins and ends, along z, y and x from 0 to 1, that has any medium; and how
+    often light goes to and fro between that and the ground. `reason`: which settings of
     `diffusion` these are, and why. `up`: which of x, y, z (0, 1, 2) points up; None where cameras
     tell.
     """
@@ -85,6 +84,7 @@ class Scene:
     reason: str = ""
     up: int | None = None
     occupied: tuple[Triple, Triple] | None = None
+    exchanges: int | None = None
 
     def __post_init__(self) -> None:
         self.settle()
@@ -98,6 +98,8 @@ class Scene:
         with torch.no_grad():
             if self.ground is not None and self.occupied is None:
                 self.occupied = find_occupied(volume, media, self.ground, optimized)
+                is_periodic = bool(volume.grid.periodic)
+                self.exchanges = choose_exchanges(self.ground, is_periodic, optimized)
             self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
             if self.render.steps_per_voxel is None:
                 steps = choose_steps(volume, self.diffusion.times)

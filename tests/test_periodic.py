@@ -13,6 +13,7 @@ from torch import Tensor
 from twins import assert_same, assert_transposes, differentiate, images_of, values_of
 
 from ddrecon.cameras import Camera, cast_rays, look_at
+from ddrecon.defaults import LEFT_OUT, MOST_EXCHANGES
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.grid import Grid
@@ -144,6 +145,20 @@ def test_a_ground_sends_back_its_part_of_all_that_leaves_a_period_downwards() ->
 
 def even(*shape: int) -> Tensor:
     return torch.full(shape, 0.3, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("albedo, exchanges", [(0.05, 1), (0.2, 2), (0.3, 3)])
+def test_light_goes_to_a_dark_ground_and_back_no_more_often_than_is_seen(
+    albedo: float, exchanges: int
+) -> None:
+    scene = repeated(half_empty(*SHAPE), **KINDS["isotropic"])
+    scene = replace(scene, ground=Ground(tensor(albedo), Plane(-0.1, 1)))
+    assert scene.exchanges == exchanges
+    more = render(replace(scene, exchanges=12)) - render(scene)
+    sent = float(scene.lights[0].irradiance) / math.pi
+    assert 0 < float(more.max()) < LEFT_OUT * sent
+    lighter = Ground(tensor(0.9), Plane(-0.1, 1))
+    assert replace(scene, ground=lighter, exchanges=None, occupied=None).exchanges == MOST_EXCHANGES
 
 
 @pytest.mark.parametrize(("travel", "ground"), [(STEEP, 0), (SLANTED, 0), (SLANTED, 1)])

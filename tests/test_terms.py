@@ -19,12 +19,12 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
-from ddrecon.lighting import solve_light
+from ddrecon.lighting import fluence, solve_light
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import view_picture
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.terms import find_doubts, needed_terms
+from ddrecon.terms import find_doubts, needed_terms, thick_terms
 
 ABOVE, DOWN = tensor(0.1, 2.0, 0.1), tensor(-0.1, -1.0, 0.1)
 LIGHTS: dict[str, Callable[[torch.Tensor], Any]] = {
@@ -112,6 +112,25 @@ def test_thick_cells_at_the_faces() -> None:
     assert f"are up to {9 * size:.3g} optical depths thick" in line
     assert doubts(*filled, grid.format(10), "volume.sigma_s=0") == []
     assert doubts(*filled, grid.format(math.ceil(20 * size)), "diffusion.refine=3") == []
+
+
+def test_cells_that_stay_thick_are_told_what_their_thirds_change() -> None:
+    """Of a volume that is small in all of its cells, else of those around the thickest."""
+    density = random_values(5, 6, 7)
+    density[2, 3, 3] = 4.0
+    thick = make_scene(density, sigma_s=(12.0,), g=0.5, refine=1, transport_rounds=2)
+
+    def changes(scene: Scene) -> list[str]:
+        return [line.split("changes by ")[1] for line in thick_terms(scene)]
+
+    thirds = replace(thick, diffusion=replace(thick.diffusion, refine=3))
+    coarse, fine = (fluence(scene) for scene in (thick, thirds))
+    weight = density * coarse
+    mean = float((density * fine).sum() / weight.sum()) - 1
+    spread = float((density * (fine - coarse) ** 2).sum() / (weight * coarse).sum()) ** 0.5
+    (line,) = changes(thick)
+    assert line.startswith(f"{mean:+.1%} in the mean, {spread:.1%} RMS") and abs(mean) > 0.001
+    assert changes(replace(thick, volume=replace(thick.volume, density=0.01 * density))) == []
 
 
 def test_a_thick_face_is_told_by_what_it_costs() -> None:

@@ -26,7 +26,7 @@ from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.settings import AUTO
-from ddrecon.terms import find_doubts, needed_terms
+from ddrecon.terms import find_doubts, needed_terms, thick_terms
 from ddrecon.variables.values import with_values
 
 TOO_WIDE = 8.0
@@ -92,7 +92,7 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
         "bounds": [low, high],
         "voxel": sides,
         "views": views,
-        "physics": needed_terms(scene),
+        "physics": [*needed_terms(scene), *thick_terms(scene)],
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
         "support": support,

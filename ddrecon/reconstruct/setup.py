@@ -175,9 +175,9 @@ def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
 
 
 def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
-    """The noise of the picture of `view`, as its scene says, by the view or for all."""
+    """The noise of the picture of `view`, as its scene says."""
     noise = settings.noise
-    return view.noise or (Noise(noise.read, noise.shot, view.step) if noise else None)
+    return Noise(noise.read, noise.shot, view.step) if noise else None
 
 
 def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:

@@ -14,8 +14,8 @@
 //
 // By cells, for a GPU, and where light enters by faces or goes around: an item is a cell of a
 // slice, for one ordinate and color. A launch does one slice of every ordinate. What moments are
-// along ordinates is known before, and what ordinates give is summed later: as products of matrices.
-// What leaves by a face of a periodic grid enters by the opposite one.
+// along ordinates is known before, and what ordinates give is summed later: as products of
+// matrices. What leaves by a face of a periodic grid enters by the opposite one.
 
 #if IS_GPU
 #define APART INLINE
@@ -310,7 +310,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         const F* const e = of.extinction + color * cells + row.at;
         F* const decays = scratch;
         const long long pitch = this->pitch;
-        const int width = this->width;
+        const int width = BY_CELLS ? 1 : this->width; // A constant: no loop is left.
         INDEPENDENT
         for (int c = 0; c < width; ++c) {
             const Decay<F> by = decay_along(step * e[c]);
@@ -436,7 +436,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F *const mean = output(MEAN, j, row), *const decays = scratch;
         F *const carried = scratch + CARRIED * pitch, *const d_carried = carried + pitch;
         const long long all = this->all, pitch = this->pitch;
-        const int width = this->width;
+        const int width = BY_CELLS ? 1 : this->width;
         INDEPENDENT
         for (int c = 0; c < width; ++c) {
             N arriving = upwind(c);
@@ -480,7 +480,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         downwind.weights[0] = F(0);
         F *const to = returning + row.returning[0], *const decays = scratch;
         const long long pitch = this->pitch;
-        const int width = this->width;
+        const int width = BY_CELLS ? 1 : this->width;
         INDEPENDENT
         for (int c = 0; c < width; ++c) {
             const F passed = decays[PASSED * pitch + c];
@@ -501,7 +501,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F *const to = returning + row.returning[0], *const e_bar = output(EXTINCTION_BAR, j, row);
         F *const sum_bar = output(SUM_BAR, j, row), *const rise_bar = output(RISE_BAR, j, row);
         const long long all = this->all, pitch = this->pitch;
-        const int width = this->width;
+        const int width = BY_CELLS ? 1 : this->width;
         const F* const decays = scratch;
         INDEPENDENT
         for (int c = 0; c < width; ++c) {

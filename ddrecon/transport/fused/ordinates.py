@@ -176,11 +176,13 @@ def _make_tables(
     points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
     if pieces is None:
-        # Those that go around are followed again and again: they are in chunks of their own.
-        groups = [
-            [Team(o.senses[0], [o], []) for o in ordinates if (o.axis in grid.periodic) == wraps]
-            for wraps in (False, True)
-        ]
+        # Those that go around are followed again and again, fewer times where light keeps to whole
+        # cells: they are in chunks of their own.
+        def kind(o: Ordinate) -> int:
+            return (o.axis in grid.periodic) * (1 + any(moved % 1 for moved in o.moved))
+
+        teams = [(kind(o), Team(o.senses[0], [o], [])) for o in ordinates]
+        groups = [[team for number, team in teams if number == n] for n in range(3)]
     else:
         groups = [_team_rows(ordinates, pieces)]
     order, rows, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()

@@ -20,21 +20,14 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
-from ddrecon.kernels.text import TextKernel, names_of
+from ddrecon.kernels.text import TextKernel, members_of, names_of
 from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
-GIVEN = (
-    "int *teams, *ordinates; F *paths, *values, *weighted, *extinction, *gradient, *source,"
-    "*d_extinction, *d_gradient, *d_source, *bars, *entering, *light, *returning, *scratch,"
-    "*outputs, *sums, *gradient_bar, *extinction_bar; int depth, height, width, periodic, count,"
-    "colors, planes, back_planes, pitch, room, first, launched, team, color, together, lanes,"
-    "begin, end"
-)
-"""What the struct `Sweep` of `ordinates.h` holds."""
-MADE = "light returning scratch outputs sums gradient_bar extinction_bar"
-"""What of that kernels write."""
+HEADER = "transport/fused/ordinates.h"
+WRITTEN = "light returning scratch outputs sums gradient_bar extinction_bar"
+"""What of the struct `Sweep` kernels write."""
 TABLES = "teams", "ordinates", "paths", "values", "weighted"
 VECTOR = 16
 """Rows of numbers begin at multiples of so many."""
@@ -194,55 +187,50 @@ def _total(sums: Tensor) -> Tensor:
 class _ByCells(_Launches):
     """A chunk of ordinates, of which light may enter cells from outside: a ring like light."""
 
+    def __init__(self, *of: Any):
+        super().__init__(*of)
+        assert self.chunk is not None
+        self.all = self.tables.chunks[self.chunk], slice(0, self.colors)
+
     def follow(self, entering: Tensor | None, _: bool = False) -> tuple[Tensor, Tensor]:
-        """Means of radiance [ordinates, C, z, y, x], or their change; and what leaves cells."""
-        chunk, colors = self._all()
+        """Means of radiance [ordinates, C, z, y, x], and light that leaves cells; or changes."""
         # Planes behind the grid and, at the end of the ring, before it.
-        light, means = self.ring(chunk, colors, self.grid.shape[0] + 2), self._outputs(1)
-        follow = self.bind("MOMENTS", chunk, colors, light=light, outputs=means, entering=entering)
+        light = self.ring(*self.all, self.grid.shape[0] + 2)
+        means = self.like.new_empty(self.like.shape)
+        follow = self.bind("MOMENTS", *self.all, light=light, outputs=means, entering=entering)
         for stage in self._slices(entering):
             follow(stage)
-        return means[0], light
+        return means, light
 
     def go_back(
         self, bars: Tensor, light: Tensor, entering: Tensor | None, light_bar: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         """Cotangents of `fields` and of what is `entering`, of those of means and `light`."""
-        chunk, colors = self._all()
         # The cotangent of what enters takes the place of that of light.
         returning = torch.zeros_like(light) if light_bar is None else light_bar.clone()
-        outputs, rings = self._outputs(3), {"light": light, "returning": returning}
-        go_back = self.bind(
-            "BACK", chunk, colors, **rings, outputs=outputs, bars=bars, entering=entering
-        )
+        outputs = source, rise, extinction = self.like.new_empty(3, *self.like.shape)
+        rings: dict[str, Any] = {"light": light, "returning": returning, "outputs": outputs}
+        go_back = self.bind("BACK", *self.all, **rings, bars=bars, entering=entering)
         for stage in reversed(self._slices(entering)):
             go_back(stage)
-        source, rise, extinction = outputs
-        gradient = torch.tensordot(self.tables.arrays["moved"][chunk.ordinates].T, rise, 1)
+        gradient = torch.tensordot(self.tables.arrays["moved"][self.all[0].ordinates].T, rise, 1)
         return extinction.sum(0), source, gradient, None if entering is None else returning
-
-    def _all(self) -> tuple[Chunk, slice]:
-        assert self.chunk is not None
-        return self.tables.chunks[self.chunk], slice(0, self.colors)
 
     def _slices(self, entering: Tensor | None) -> list[range]:
         """The slice of each launch, and with faces what lies behind the last."""
         count = max(self.grid.shape) + (entering is not None)
         return [range(s, s + 1) for s in range(count)]
 
-    def _outputs(self, count: int) -> Tensor:
-        """What ordinates give in each cell."""
-        return self.like.new_empty(count, self._all()[0].count, *self.like.shape[1:])
-
 
 @functools.cache
 def _kernel(run: str, is_dual: bool, by_rows: bool, bits: int) -> TextKernel:
     """The kernel of a `run` of `Ordinates`."""
+    declared = members_of(HEADER, "Sweep")
     kind = f"Ordinates<{'Dual<F>' if is_dual else 'F'}, F, {str(not by_rows).lower()}>"
-    text = f"F cell[{kind}::CELL]; const Sweep<F> of = {{{names_of(GIVEN)}}};"
+    text = f"F cell[{kind}::CELL]; const Sweep<F> of = {{{names_of(declared)}}};"
     text += f"{kind}(item, of, cell).run<{kind}::{run}>();"
     name = f"ordinates_{run.lower()}"
-    return TextKernel(name, bits, text, GIVEN, MADE, "transport/fused/ordinates.h")
+    return TextKernel(name, bits, text, declared, WRITTEN, HEADER)
 
 
 def sweep_ordinates(
