@@ -90,7 +90,7 @@ class RowFunction:
             "colors": colors,
             "numbers": numbers,
             "fields": fields,
-            "channels": [len(field) for field in fields],
+            "channels": [field.shape[0] for field in fields],
             **self.more,
             **more,
         }
