@@ -35,15 +35,15 @@ from figures import print_header, print_row
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from ddrecon.bench import fade, plume_density
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.picture import render
-from ddrecon.reference.trace import Traced, open_tracer
+from ddrecon.reference.trace import Traced, error_text, open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings
-from ddrecon.validate.hard import fade, plume_density
 from ddrecon.variables.values import with_values
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -246,11 +246,6 @@ def trace(name: str, scene: Scene, folder: Path) -> Traced:
     return Traced.of(images)
 
 
-def as_seen(error: float, noise: float) -> str:
-    """`error`, or that it is below what can be told from such noise."""
-    return f"{error:.3f}" if error > noise / 3 else f"< {noise / 3:.3f}"
-
-
 def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
     """The name, scene file and path-traced image of each of the eleven cases."""
     cases = []
@@ -282,7 +277,7 @@ def print_eleven(folder: Path, place: Path) -> None:
         found = [
             traced.error(image_of(load_scene(path, overrides=model))) for model in MODELS.values()
         ]
-        print_row(name, f"{traced.noise:.3f}", *(as_seen(error, traced.noise) for error in found))
+        print_row(name, traced.noise, *(error_text(error, traced.noise) for error in found))
         errors.append(found)
     for name, kind in (("mean", np.mean), ("worst", np.max)):
         print_row(name, "", *(f"{error:.4f}" for error in kind(errors, axis=0)))
@@ -313,10 +308,10 @@ def print_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> None:
         path = case.write(place)
         traced = trace(case.name, load_scene(path), folder / "traced")
         errors = (
-            as_seen(traced.error(image_of(load_scene(path, overrides=model))), traced.noise)
+            error_text(traced.error(image_of(load_scene(path, overrides=model))), traced.noise)
             for model in MODELS.values()
         )
-        print_row(case.name, f"{traced.noise:.3f}", *errors)
+        print_row(case.name, traced.noise, *errors)
 
 
 THICK_CELLS, FINER = 12, 6

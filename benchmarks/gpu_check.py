@@ -5,7 +5,8 @@
 Without names all stages run, in their order: machine, kernels, speed, agree, bits, graphs,
 optimize, tests, top, shortage. Each prints its table line by line, and the seconds it took. A stage
 that fails says so, the next one goes on, and the exit status is 1. All of it is also in
-`$OUT/gpu_check.txt`, where that is set. `--device cpu --shrink 4` tries the script where there is
+`$OUT/gpu_check.txt`, where that is set. Configs have pictures in EXR: besides what ddrecon needs,
+stages need Warp, OpenImageIO and pytest. `--device cpu --shrink 4` tries the script where there is
 no GPU: grids and images are four times smaller, and kernels are not optimized.
 """
 
@@ -30,6 +31,7 @@ from speed import start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from ddrecon.bench import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError, SceneError, UsageError
@@ -40,7 +42,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.validate.hard import plume_scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 ROOT = Path(__file__).parents[1]
@@ -49,7 +50,6 @@ CELLS = 3000
 """Scenes are compared in at most about so many cells."""
 AGREEMENT = 1e-9
 """What else than rounding makes a difference is more: solves end at the same iteration."""
-COMMAND = "from ddrecon.cli import main; main()"
 SECONDS = 6.0
 """So long iterations of one run are timed, at most twelve of them."""
 
@@ -65,13 +65,6 @@ class Check:
     @property
     def is_gpu(self) -> bool:
         return self.device.type == "cuda"
-
-    @property
-    def setting(self) -> str:
-        """What a process does before all else: what is only tried is compiled as tests do it."""
-        if self.shrink == 1 or self.engine == "torch":
-            return ""
-        return "import warp; warp.config.optimization_level = 0"
 
     def now(self) -> float:
         """The time, once the device has done what it was given."""
@@ -340,12 +333,14 @@ def tests(check: Check) -> Iterator[str]:
 def optimize(check: Check) -> Iterator[str]:
     """The plume from the command line, as anybody runs it."""
     with tempfile.TemporaryDirectory() as folder:
-        command = ["-c", f"{check.setting}\n{COMMAND}"]
-        command += ["optimize", str(CONFIGS / "plume.yaml"), "-o", folder, "--overwrite"]
-        command += ["--device", check.device.type, "--engine", check.engine]
-        if check.shrink > 1:
+        command = ["-m", "ddrecon", "optimize", str(CONFIGS / "plume.yaml"), "-o", folder]
+        command += ["--overwrite", "--device", check.device.type]
+        if check.shrink == 1:
+            command += ["--engine", check.engine]
+        else:
             sizes = [size // check.shrink for size in (64, 96, 64)]
             command += ["--iterations", "3", "-D", f"volume.resolution={sizes}"]
+            command += ["--engine", "torch"]  # which compiles nothing
         start = time.perf_counter()
         end = run_python(*command)
         yield "\n".join((end.stdout + end.stderr[-600:]).splitlines()[-12:])
@@ -359,16 +354,12 @@ def shortage(check: Check) -> Iterator[str]:
         yield "no GPU, no shortage"
         return
     whole = torch.cuda.get_device_properties(0).total_memory
-    setting = f"import torch; torch.cuda.set_per_process_memory_fraction({2**28 / whole})"
+    text = (
+        f"import torch; torch.cuda.set_per_process_memory_fraction({2**28 / whole}); "
+        "from ddrecon.cli import main; main()"
+    )
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            "-c",
-            f"{setting}; {COMMAND}",
-            "optimize",
-            str(CONFIGS / "plume.yaml"),
-            "-o",
-            folder,
-        ]
+        command = ["-c", text, "optimize", str(CONFIGS / "plume.yaml"), "-o", folder]
         command += ["--overwrite", "--device", "cuda", "-D", "volume.resolution=[192,288,192]"]
         end = run_python(*command)
     yield f"exit {end.returncode}: {end.stderr[-900:]}"
@@ -390,7 +381,10 @@ def main() -> None:
     check = Check(torch.device(arguments.device), arguments.shrink, arguments.engine)
     use_engine(check.engine)
     folder, failed = os.environ.get("OUT"), False
-    exec(check.setting)
+    if check.shrink > 1 and check.engine == "warp":
+        import warp
+
+        warp.config.optimization_level = 0  # as in tests, whose kernels then need no compiling
 
     def tell(line: str) -> None:
         print(line, flush=True)

@@ -1,11 +1,12 @@
 """What an iteration of a reconstruction asks of the machine: calls, launches, waits.
 
-    python benchmarks/launches.py [--views 3] [--device cpu] [--modules] [--plume] [--as-a-gpu]
+    python benchmarks/launches.py [--plume] [--config NAME] [--modules] [--as-a-gpu]
 
 Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
 another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full
-resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels. `--as-a-gpu`
-makes a GPU's choices on a processor (`tests/as_on_a_gpu.py`), which takes some minutes.
+resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels, and `--config`
+another one of `configs` as it is. `--as-a-gpu` makes a GPU's choices on a processor
+(`tests/as_on_a_gpu.py`), which takes some minutes.
 
 A call is an operation of torch, which on a GPU costs at least 5 microseconds; not counted are views
 of tensors, memory without numbers yet, and numbers that are read. A launch is that of a fused
@@ -33,12 +34,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ddrecon
+from ddrecon.bench import plume_scene
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.validate.hard import plume_scene
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(ddrecon.__file__).parent
@@ -189,10 +190,15 @@ def begin_plume(cells: int, pixels: int, rounds: int, device: str) -> Reconstruc
     return start_run(replace(scene, diffusion=settings))
 
 
+def load_config(name: str, rounds: int, device: str) -> Scene:
+    """The scene of a file in `configs`."""
+    overrides = [f"diffusion.transport_rounds={rounds}"]
+    return load_scene(ROOT / "configs" / f"{name}.yaml", overrides=overrides, device=device)
+
+
 def load(views: int, rounds: int, device: str) -> Scene:
     """The plume at full resolution, from half its density."""
-    overrides = [f"diffusion.transport_rounds={rounds}"]
-    scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=overrides, device=device)
+    scene = load_config("plume", rounds, device)
     density = torch.tensor(read_field(ROOT / "data" / "plume" / "density.npz", "density").values)
     start = 0.5 * density.to(scene.volume.density)
     seen = [view for view in scene.views if not view.is_test][:views]
@@ -249,6 +255,7 @@ def main() -> None:
     parser.add_argument("--engines", nargs="+", default=ENGINES, choices=ENGINES)
     parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
     parser.add_argument("--plume", action="store_true")
+    parser.add_argument("--config")
     parser.add_argument("--modules", action="store_true")
     parser.add_argument("--as-a-gpu", action="store_true")
     options = parser.parse_args()
@@ -264,6 +271,8 @@ def main() -> None:
             with choices():
                 if options.plume:
                     run = begin_plume(64, 512, rounds, options.device)
+                elif options.config:
+                    run = Reconstruction(load_config(options.config, rounds, options.device))
                 else:
                     run = Reconstruction(load(options.views, rounds, options.device))
                 found[engine, rounds] = count(run)

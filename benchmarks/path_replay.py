@@ -24,11 +24,10 @@ from figures import print_header, print_row
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench import Shot, shoot
+from ddrecon.bench import Shot, plume_scene, shoot
 from ddrecon.reference.mitsuba_scene import LONGEST, mitsuba_scene, sensor_id
 from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
-from ddrecon.validate.hard import plume_scene
 
 REPEATS, BLOCK = 5, 4
 DENSITY = ".sigma_t.data"

@@ -3,7 +3,7 @@
     python benchmarks/speed.py scale|engines|tangents [--threads 2]
 
 `scale`: seconds of an iteration of a reconstruction of the plume
-of `ddrecon.validate.hard`, from half its density and its own images, as one thing grows at a time:
+of `ddrecon.bench`, from half its density and its own images, as one thing grows at a time:
 cells (with them the width of the image, two pixels a cell), pixels, views, lights, colors; and the
 exponents fitted to them. `engines`: both engines, by turns in one process; how far apart they are.
 `tangents`: images, derivatives and tangents by warp, of one thread.
@@ -28,6 +28,7 @@ from figures import print_header, print_row
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ddrecon.bench import plume_scene
 from ddrecon.cameras import look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
@@ -38,7 +39,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import OptimizeSettings, ParameterSettings
-from ddrecon.validate.hard import plume_scene
 from ddrecon.variables.values import value_of, with_values
 
 ROOT = Path(__file__).parents[1]

@@ -28,7 +28,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.experiments import EMPTY, Uncertainty, mean_around
+from ddrecon.uncertainty import EMPTY, Uncertainty, mean_around
 
 ROOT = Path(__file__).parents[1]
 Known = tuple[Scene, Tensor]

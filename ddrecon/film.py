@@ -51,6 +51,7 @@ from ddrecon.report.volumes import Shown, describe_volume, describe_world
 from ddrecon.run.job import (
     CHECKPOINTS,
     PREVIOUS,
+    Job,
     Outcome,
     fingerprint,
     has_checkpoint,
@@ -65,7 +66,6 @@ from ddrecon.run.run_folder import (
     REPORT,
     SCENE,
     SUMMARY,
-    Iterations,
     Run,
     field_key,
     fields_to_export,
@@ -209,7 +209,7 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
-class Calibration(Iterations):
+class Calibration(Job):
     """The job of what the frames `numbers` of a `film` share, found from them together."""
 
     def __init__(self, film: Film, numbers: Sequence[int]):

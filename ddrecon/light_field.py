@@ -42,7 +42,7 @@ from ddrecon.light.reduced import (
 from ddrecon.light.sky import Sky, Source
 from ddrecon.march.faces import receive_at_faces
 from ddrecon.march.ground import LitGround
-from ddrecon.march.periods import HALO
+from ddrecon.march.integral import HALO
 from ddrecon.medium.coefficients import (
     Medium,
     Volume,
@@ -56,7 +56,7 @@ from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.layout import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.settings import DiffusionSettings
-from ddrecon.transport.bounced import reflected_light
+from ddrecon.transport.mirror import reflected_light
 from ddrecon.transport.rounds import face_mirror, run_rounds, sweep_emission
 from ddrecon.transport.sweep import DIRECTIONS
 

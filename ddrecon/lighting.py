@@ -27,8 +27,8 @@ from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.medium.coefficients import Medium, resample, volume_at_level
 from ddrecon.medium.optics import transmitted_moments
 from ddrecon.numerics.autodiff import recompute
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import Unrolled
+from ddrecon.numerics.sphere import harmonics
 from ddrecon.scene import Scene, require_supported
 
 MOST_CELLS = 32

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.numerics.sphere import count_harmonics
 from ddrecon.settings import DiffusionSettings
 
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")

@@ -24,7 +24,6 @@ from ddrecon.light.ground import Ground
 from ddrecon.light.lights import BeamLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
-from ddrecon.pictures import Noise
 from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
@@ -38,7 +37,7 @@ class View:
 
     What its camera does to radiance (E9.1): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
     0; `background` [C, h, w] or [C, 1, 1] is what the picture shows where the volume is empty, None
-    for the light behind it. `step` and `noise` say how the picture errs, see `ddrecon.pictures`.
+    for the light behind it. `step` says how the picture errs, see `ddrecon.pictures`.
     """
 
     name: str
@@ -51,7 +50,6 @@ class View:
     offset: Tensor | None = None
     background: Tensor | None = None
     step: float = bounded(0.0, minimum=0)
-    noise: Noise | None = None
 
     @property
     def seen(self) -> Tensor:

@@ -32,7 +32,7 @@ from ddrecon.medium.coefficients import (
     volume_at_level,
 )
 from ddrecon.medium.optics import transmitted_moments
-from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.numerics.sphere import count_harmonics
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.sweep import count_directions

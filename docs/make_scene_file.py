@@ -91,7 +91,7 @@ SECTIONS: list[tuple[str, type]] = [
     ("render", settings.RenderSettings),
     ("diffusion", settings.DiffusionSettings),
     ("optimize", settings.OptimizeSettings),
-    ("optimize.noise, or noise of a view", settings.NoiseSettings),
+    ("optimize.noise", settings.NoiseSettings),
     ("optimize.parameters: {NAME: ...}", settings.ParameterSettings),
 ]
 """Each section: its heading, and its record."""

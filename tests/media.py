@@ -17,7 +17,7 @@ from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase_peak import SeenPhase, peaked_series
+from ddrecon.medium.phase import SeenPhase, peaked_series
 from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View

@@ -20,7 +20,6 @@ from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.pictures import Noise
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
@@ -281,7 +280,6 @@ RECORDS: dict[str, list[Any]] = {
     "views.0.background": [torch.full((1, 1, 1), NAN), torch.ones(2), 0.5],
     "views.0.weight": [NAN],
     "views.0.step": [NAN],
-    "views.0.noise": [Noise(NAN, 0.0)],
     "views.0.image": [torch.ones(3, 5, 4)],
     "views.0.mask": [torch.ones(2, 5)],
     "views.0.camera.size": [(0, 4)],

@@ -283,7 +283,7 @@ def uncertainty(session: Session, source: Path, experiments: int) -> None:
     from ddrecon.run.job import work
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
-    from ddrecon.uncertainty.experiments import Uncertainty
+    from ddrecon.uncertainty import Uncertainty
 
     require_no_film(source)
     run = load_run(source, lambda dtype: session.build(session.read(source / "scene.yaml"), dtype))
@@ -353,7 +353,7 @@ def bench(session: Session, source: Path | None, is_quick: bool, is_hard: bool) 
         if folder is not None:
             folder.clear()
         if is_hard:
-            from ddrecon.validate.hard import hard_lines, run_cases
+            from ddrecon.bench import hard_lines, run_cases
 
             report = run_cases(session.start(), session.progress)
             lines = hard_lines(report)
@@ -410,7 +410,7 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
     from ddrecon.reference.exchange import export_scene
     from ddrecon.run.run_folder import LENGTHS, fields_to_export
     from ddrecon.scene_file.camera_files import export_transforms
-    from ddrecon.uncertainty.experiments import volumes_in
+    from ddrecon.uncertainty import volumes_in
 
     volumes = tuple(volume for path in source for volume in volumes_in(path) or [path])
     is_of_scene = kind not in WRITTEN or any(map(_is_scene, volumes))

@@ -153,14 +153,8 @@ def beside(extended: Tensor) -> Tensor:
 
     Of `extended` [C, z + 2, y + 2, x + 2].
     """
-    neighbors = list[Tensor]()
-    for axis in AXES:
-        column = extended
-        for other in {*AXES} - {axis}:
-            column = column.narrow(other, 1, extended.shape[other] - 2)
-        count = extended.shape[axis] - 2
-        neighbors += [column.narrow(axis, 0, count), column.narrow(axis, 2, count)]
-    return torch.stack(neighbors, 1)
+    cells = slice(None), *[slice(1, -1)] * 3
+    return torch.stack([extended.roll(way, axis)[cells] for axis in AXES for way in (1, -1)], 1)
 
 
 def slopes(grid: Grid, extended: Tensor) -> list[Tensor]:

@@ -125,11 +125,7 @@ def prepare(operator: Operator) -> Hierarchy:
 
 
 def _iterate(
-    operator: Operator,
-    source: Tensor,
-    guess: Tensor | None,
-    tolerance: float,
-    count: int | None,
+    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float, count: int | None
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     kind: type[Any] = TensorSteps

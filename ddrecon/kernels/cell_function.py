@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly, with_signature
 
 Tensors = tuple[Tensor, ...]
 
@@ -103,6 +103,7 @@ class _Applied(torch.autograd.Function):
     """A function applied to all cells."""
 
     @staticmethod
+    @with_signature
     def forward(function: RowFunction, numbers: Tensor, *fields: Tensor) -> Tensors:
         if any(tensor.requires_grad for tensor in (numbers, *fields)):
             varied = _one_by_one(fields[: len(fields) - function.added])

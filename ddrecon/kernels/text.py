@@ -34,7 +34,8 @@ _TYPES = {
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
 }
-_PACKETS = Path(__file__).with_name("packets.h").read_text(encoding="utf-8")
+PACKAGE = Path(__file__).parents[1]
+_PACKETS = (PACKAGE / "kernels/packets.h").read_text(encoding="utf-8")
 LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
 """Items in a packet on a processor (`packets.h`)."""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
@@ -135,11 +136,12 @@ class TextKernel:
         arrays = list[Tensor]()
         for name, value in values.items():
             is_list = name in self.lists
-            entries = zip(self.lists[name], value, strict=True) if is_list else [(name, value)]
+            entries = zip(self.lists[name], value, strict=True) if is_list else ((name, value),)
             for entry, number in entries:
                 if isinstance(number, Tensor):
-                    if name not in self.written:
-                        number = number.to(self.arrays.get(entry)).contiguous()
+                    dtype, is_plain = self.arrays.get(entry), number.is_contiguous()
+                    if name not in self.written and not (is_plain and number.dtype is dtype):
+                        number = number.to(dtype).contiguous()
                     arrays.append(number)
                 self.write(record, entry, number)
         return arrays
@@ -174,7 +176,7 @@ def _texts(header: str) -> dict[str, str]:
 
     By texts, not paths, a kernel is the same wherever the package lies.
     """
-    text, texts = (Path(__file__).parents[1] / header).read_text(encoding="utf-8"), {}
+    text, texts = (PACKAGE / header).read_text(encoding="utf-8"), {}
     for included in _INCLUDE.findall(text):
         texts |= _texts(included)
     text = _INCLUDE.sub("", text.removeprefix("#pragma once"))
@@ -203,6 +205,18 @@ def declarations(declared: str) -> Iterator[tuple[str, bool, str, int]]:
         for name in names.split(","):
             star, variable, count = re.fullmatch(r"(\*?)(\w+)(?:\[(\d+)\])?", name.strip()).groups()
             yield word, bool(star), variable, int(count or 0)
+
+
+@functools.cache
+def members_of(header: str, struct: str) -> str:
+    """What a `struct` of a `header` holds before its functions, as kernels declare it.
+
+    Without lists of pointers: how many there are, a kernel says.
+    """
+    text = (PACKAGE / header).read_text(encoding="utf-8")
+    (members,) = re.findall(rf"struct {struct} {{\n((?:    [^/(]*?;\n)+)", text)
+    members = re.sub(r".*\* const\*.*\n|const |\n", "", members).replace("* ", " *")
+    return re.sub("long long|Size", "long", members)
 
 
 def names_of(declared: str) -> str:

@@ -15,12 +15,12 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
 from ddrecon.medium.coefficients import Medium, along_colors, mean_width, remaining_moments
-from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.phase import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.decay import Nodes
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import resize
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.sphere import harmonics
 
 MOST_NUMBERS = 1 << 23
 """Numbers of masses held at once, or a quarter of the moments' where that is more: cells then

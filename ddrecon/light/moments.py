@@ -1,6 +1,6 @@
 """Light in angle: phi [K, C, z, y, x], its spherical-harmonics moments (docs/theory.md E2.8).
 
-radiance(w) is the sum over k of Y_k(w) phi_k, with the harmonics of `numerics/harmonics.py`, whose
+radiance(w) is the sum over k of Y_k(w) phi_k, with the harmonics of `numerics/sphere.py`, whose
 mean square over the sphere is 1; up to degree L there are K = (L + 1)^2. So phi[0] is L0, the mean
 over the sphere, and sqrt(3) phi[1:4] is the flux L1, along y, z and x. Sources (Q0, Q1, ...),
 diffuse light, and what scatters towards a camera all have this form. K is 1 where light's direction
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.harmonics import count_harmonics, each_harmonic, harmonics
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.sphere import count_harmonics, each_harmonic, harmonics
 
 _ROOT = 3**0.5
 _AXES = 1, 0, 2

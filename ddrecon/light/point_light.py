@@ -22,7 +22,7 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import beam_moments
 from ddrecon.medium.coefficients import Medium, along_colors
-from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.phase import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.decay import Nodes
 from ddrecon.numerics.interpolation import sample_volume

@@ -22,10 +22,9 @@ from ddrecon.light.profile import RefractedBeam, enter_faces, profile_in, refrac
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium, has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, recompute
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import Unrolled
-from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from ddrecon.medium.coefficients import (
     remaining_moments,
     thinness,
 )
-from ddrecon.numerics.autodiff import differentiate_once, is_fused, run_plainly
+from ddrecon.numerics.autodiff import differentiate_once, is_fused, run_plainly, with_signature
 from ddrecon.numerics.remember import remember
 
 GRAZING = 0.1
@@ -114,6 +114,7 @@ class _Product(torch.autograd.Function):
     """`_Pair.times`, differentiable in both modes."""
 
     @staticmethod
+    @with_signature
     def forward(pair: _Pair, values: Tensor, within: Tensor | None) -> Tensor:
         total = None if within is None else pad(within, [1] * 6).flatten(1)
         return pair.table.times(values, total)

@@ -1,7 +1,8 @@
 """Light on the ground under a medium, and the ground as cameras see it (docs/theory.md E5.1).
 
-Direct light, with its shadows, is found at each point that is asked for. Light of the sky and of
-the medium is smooth: it is found on texels, by parallel rays through all of them at once.
+Direct light comes by the straight way, as it was sent. It is found, with its shadows, at each point
+that is asked for. Light of the sky and of the medium is smooth: it is found on texels, by parallel
+rays through all of them at once.
 """
 
 from __future__ import annotations
@@ -14,21 +15,65 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.grid import Grid
+from ddrecon.grid import Grid, array_order
 from ddrecon.light.beam import unit_directions
 from ddrecon.light.ground import Ground, Plane, hemisphere, look_up_texels, texel_centers
-from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
+from ddrecon.light.profile import mean_profile, seen_radius
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source
-from ddrecon.march.direct import Beamed, rays_against, shine_on, transmittance
 from ddrecon.march.faces import extend_fields
-from ddrecon.march.integral import march
+from ddrecon.march.integral import absorb, march
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
+
+Beamed = DirectionalLight | PointLight | BeamLight
+
+
+def shine_on(
+    light: Beamed,
+    points: Tensor,
+    grid: Grid,
+    width: float | Tensor,
+    size: Sequence[float] = (0.0, 0.0, 0.0),
+) -> tuple[Rays, Tensor, Tensor]:
+    """Rays through `points` [R, 3], the way light goes there [R, 3], and its irradiance [C, R].
+
+    That is on planes that face it, of beams the mean over boxes of `size` around the points; no
+    beam is thinner than cells of `width` allow.
+    """
+    if isinstance(light, PointLight):
+        eye = array_order(light.position)
+        distance = torch.linalg.vector_norm(points - eye, dim=1)
+        rays = Rays(eye.expand_as(points), (points - eye) / distance[:, None], eye)
+        return rays, rays.direction, light.intensity[:, None] / distance**2
+    _, travel = unit_directions(light.direction)
+    rays = rays_against(grid, points, travel)
+    if isinstance(light, DirectionalLight):
+        return rays, -rays.direction, light.irradiance[:, None]
+    beam = light.position, light.direction, seen_radius(light.radius, width)
+    profile = mean_profile(points.unbind(1), size, *beam)
+    return rays, -rays.direction, light.power[:, None] * profile
+
+
+def rays_against(grid: Grid, points: Tensor, travel: Tensor) -> Rays:
+    """Rays through `points` [R, 3] against light that goes along `travel` [3].
+
+    They begin behind the points, outside of the box: a point may lie where light leaves it.
+    """
+    way = travel.expand_as(points)
+    return Rays(points + max(grid.extent) * way, -way, None)
+
+
+def transmittance(medium: Medium, rays: Rays, settings: RenderSettings) -> Tensor:
+    """The transmittance [C, R] of `medium` along `rays`."""
+    light = rays.direction.new_ones(1, len(rays.direction))
+    return march(absorb(medium), look_along(medium.grid, rays, settings), settings, light)
+
 
 DOWNWARDS = 48
 """Directions of the light that the ground receives from sky and medium."""
@@ -124,11 +169,7 @@ def upwards(plane: Plane) -> tuple[Tensor, Tensor]:
 
 @remember
 def _sights(
-    grid: Grid,
-    plane: Plane,
-    settings: RenderSettings,
-    dtype: torch.dtype,
-    device: torch.device,
+    grid: Grid, plane: Plane, settings: RenderSettings, dtype: torch.dtype, device: torch.device
 ) -> tuple[Sight, ...]:
     """Those of rays from all texels, one for each direction."""
     like = torch.empty(0, dtype=dtype, device=device)

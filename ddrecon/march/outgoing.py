@@ -13,7 +13,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient, for_channels
-from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.phase import SeenPhase
 from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.numerics.layout import Unrolled
 

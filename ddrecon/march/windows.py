@@ -17,9 +17,9 @@ from ddrecon.march.samplers import cross_box
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.optics import reflectance, refract
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.sphere import harmonics
 from ddrecon.settings import RenderSettings
 
 

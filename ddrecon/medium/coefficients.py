@@ -17,9 +17,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Cells, Grid
-from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, henyey_greenstein
-from ddrecon.medium.phase_peak import (
+from ddrecon.medium.phase import (
+    Blend,
+    HenyeyGreenstein,
+    PhaseFunction,
     SeenPhase,
+    henyey_greenstein,
     is_scaled,
     number_place,
     number_table,

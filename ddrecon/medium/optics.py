@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.extras import load_extra
-from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.series import STEPS
+from ddrecon.numerics.sphere import sphere_quadrature
 
 WHITE = 1500.0
 """The temperature of a flame [K], at which the luminance of B is 1."""

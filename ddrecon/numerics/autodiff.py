@@ -6,6 +6,7 @@ Every name of torch that is private, or not documented, stands in this file.
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from types import CellType, FunctionType, MethodType
@@ -116,6 +117,15 @@ class _Plain(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
         ctx.mark_non_differentiable(*tensors_in(output))
+
+
+def with_signature(forward: Callable[..., T]) -> Callable[..., T]:
+    """The `forward` pass of a custom function that is applied often.
+
+    torch asks for its signature each time, which takes as long as a launch unless it is known.
+    """
+    forward.__signature__ = inspect.signature(forward)  # type: ignore[attr-defined]
+    return forward
 
 
 def differentiate_once(backward: Callable[..., T]) -> Callable[..., T]:

@@ -130,7 +130,8 @@ def differentiate_view(
     They are those by `values` and by the leaves of the light; None is zero.
     """
     # Views share what is made of values: so that each has a graph of its own, it is made anew.
-    world = with_values(scene, {n: value for n, value in values.items() if not is_of_volume(n)})
+    outside = {n: value for n, value in values.items() if not is_of_volume(n)}
+    world = with_values(scene, outside) if outside else scene
     view, inputs = world.view(name), [*values.values(), *cut.leaves]
     derivatives = scene.optimize.derivatives if scene.optimize else "all"
     image = view_picture(cut.light_field, world, view, derivatives)

@@ -53,10 +53,10 @@ class Reconstruction:
     """A run of a `scene`: the `search` that moves its parameters, and the `schedule` that ends it.
 
     Its `frames` are that scene and `others`, which differ in their pictures: several of a film
-    share all parameters but their fields. `blocks` are the parameters of all, by frame and name,
-    whose entries follow each other in vectors; the single `numbers` among them come last.
-    `diagonal` is the metric of the other blocks; `rival` is the loss of images and the values
-    that a trial has to beat. `problem`, `memory` and `parameters` are those of the first frame.
+    share all parameters but their fields. `blocks` are the parameters of all, whose entries follow
+    each other in vectors; the single `numbers` among them come last. `diagonal` is the metric of
+    the others; `rival` is the loss of images and the values that a trial has to beat. `problem`,
+    `memory` and `parameters` are those of the first frame.
     """
 
     def __init__(
@@ -73,11 +73,10 @@ class Reconstruction:
         names = {p.name: p for p in self.shared}
         for frame in self.frames:
             frame.parameters = [names.get(p.name, p) for p in frame.parameters]
-        pairs = [(n, p) for n, frame in enumerate(self.frames) for p in frame.parameters]
         self.numbers = Numbers(problem.train, self.parameters)
-        pairs.sort(key=lambda pair: pair[1] in self.numbers.places)
-        self.blocks = {_key(n, p): p for n, p in pairs}
-        stages = find_stages(len(problem.factors), problem.train, list(self.blocks.values()))
+        blocks = dict.fromkeys(p for frame in self.frames for p in frame.parameters)
+        self.blocks = sorted(blocks, key=lambda p: p in self.numbers.places)
+        stages = find_stages(len(problem.factors), problem.train, self.blocks)
         self.schedule = Schedule(problem.settings.iterations, stages)
         self.rival: tuple[float, Tensor] = (math.inf, torch.empty(0))
         for frame in self.frames:
@@ -123,7 +122,7 @@ class Reconstruction:
         fraction = self.problem.settings.keep_start
         if fraction and is_over:
             # In the end, fields get back a part of what they began with.
-            for p in self.blocks.values():
+            for p in self.blocks:
                 if p.is_field:
                     p.keep_start(fraction)
         is_test_due = is_over or (self.iteration + 1) % tuning.TEST_EVERY == 0
@@ -200,7 +199,7 @@ class Reconstruction:
             frame.enter(self.schedule.stage.level)
 
         def carry(entries: Sequence[Tensor], is_slope: bool) -> Tensor:
-            carried = zip(self.blocks.values(), entries, strict=True)
+            carried = zip(self.blocks, entries, strict=True)
             return torch.cat([p.carry(entry, is_slope).flatten() for p, entry in carried])
 
         # How the objective bends, and how long the metric is, hardly changes with resolution.
@@ -209,8 +208,8 @@ class Reconstruction:
 
     def _begin_search(self, pairs: list[Pair], scales: list[float], weight: float) -> None:
         self.diagonal = torch.empty(0)
-        fields = [p.value for p in self.blocks.values() if p not in self.numbers.places]
-        sizes = [value.numel() for value in fields] + [self.numbers.size] * bool(self.numbers.size)
+        sizes = [p.value.numel() for p in self.blocks if p not in self.numbers.places]
+        sizes += [self.numbers.size] if self.numbers.size else []
         start = self._project(self._map(lambda p: p.value.detach()))
         space = Space(self._project, self._free, self._metric, sizes)
         self.search: Search = Search(space, start, weight, pairs, scales)
@@ -224,7 +223,7 @@ class Reconstruction:
             try:
                 return [frame.evaluate() for frame in self.frames]
             except (SolveError, NotFiniteError) as error:
-                failure = explain_divergence(self.iteration + 1, list(self.blocks.values()), error)
+                failure = explain_divergence(self.iteration + 1, self.blocks, error)
                 if not search.is_new:
                     # Light that cannot be solved for is as bad as light that is far off.
                     search.shorten(math.inf)
@@ -269,52 +268,43 @@ class Reconstruction:
     def _metric(self, values: Tensor, free: Tensor, vectors: Tensor) -> Tensor:
         """The inverse metric at `values`, of what is `free`, times `vectors` [m, n]."""
         waiting, weight, results = self.schedule.stage.waiting, self.search.weight, list[Tensor]()
-        entries = zip(*map(self._split, (values, free, self.diagonal)), strict=True)
-        fields = [p for p in self.blocks.values() if p not in self.numbers.places]
-        columns = vectors.split(self.search.space.sizes, 1)
-        blocks = zip(fields, entries, columns, strict=False)  # numbers come last
-        for p, (value, is_free, diagonal), column in blocks:
-            residuals = column.reshape(-1, *value.shape)
+        entries = map(self._split, (values, free, self.diagonal))
+        groups = vectors.split(self.search.space.sizes, 1)
+        for p, value, is_free, diagonal, group in zip(self.blocks, *entries, groups, strict=False):
+            if p in self.numbers.places:
+                results.append(self.numbers.precondition(values, free, group))
+                break
+            residuals = group.reshape(-1, *value.shape)
             if p.tv and p.name not in waiting:
                 moves = apply_metric(p, value, diagonal, weight, is_free, residuals)
             else:
                 moves = residuals * (is_free / diagonal)
             results.append(moves.flatten(1))
-        if self.numbers.size:
-            results.append(self.numbers.precondition(values, free, vectors))
         return torch.cat(results, 1)
 
     def _put(self, values: Tensor) -> None:
-        for p, value in zip(self.blocks.values(), self._split(values), strict=True):
+        for p, value in zip(self.blocks, self._split(values), strict=True):
             p.value = value.detach().requires_grad_()
 
     def _split(self, vector: Tensor) -> list[Tensor]:
         """The entries of each block in a `vector`, in its shape."""
-        blocks = [p.value for p in self.blocks.values()]
-        entries = vector.split([value.numel() for value in blocks])
-        return [entry.view(value.shape) for entry, value in zip(entries, blocks, strict=True)]
+        entries = vector.split([p.value.numel() for p in self.blocks])
+        return [entry.view_as(p.value) for entry, p in zip(entries, self.blocks, strict=True)]
 
     def _map(self, function: Callable[..., Tensor], *vectors: Tensor) -> Tensor:
         """What `function` makes of each parameter, and of its entries in `vectors`, as a vector."""
-        entries = zip(self.blocks.values(), *map(self._split, vectors), strict=True)
+        entries = zip(self.blocks, *map(self._split, vectors), strict=True)
         return torch.cat([function(*block).flatten() for block in entries])
 
     def _gather(self, of_frames: Sequence[Mapping[str, Tensor]]) -> Tensor:
         """The sum of each frame's tensors, by parameter, as a vector; what is missing is 0."""
-        sums: dict[tuple[int, str], Tensor] = {}
-        for n, (frame, tensors) in enumerate(zip(self.frames, of_frames, strict=True)):
+        sums: dict[Parameter, Tensor] = {}
+        for frame, tensors in zip(self.frames, of_frames, strict=True):
             for p in frame.parameters:
                 if p.name in tensors:
-                    key, tensor = _key(n, p), tensors[p.name]
-                    sums[key] = sums[key] + tensor if key in sums else tensor
-        blocks = self.blocks.items()
-        entries = (sums[k] if k in sums else torch.zeros_like(p.value) for k, p in blocks)
+                    sums[p] = sums[p] + tensors[p.name] if p in sums else tensors[p.name]
+        entries = (sums[p] if p in sums else torch.zeros_like(p.value) for p in self.blocks)
         return torch.cat([entry.flatten() for entry in entries])
-
-
-def _key(number: int, p: Parameter) -> tuple[int, str]:
-    """The search's name of a parameter of frame `number`: fields are each frame's own."""
-    return (number if p.is_field else 0), p.name
 
 
 def _as(like: Tensor, entry: Any) -> Any:

@@ -177,11 +177,11 @@ class Numbers:
         return float(twists @ slope) / 2
 
     def precondition(self, values: Tensor, free: Tensor, vectors: Tensor) -> Tensor:
-        """The inverse of the matrix times `vectors` [m, n], of what is `free` [n] and no gauge.
+        """The inverse of the matrix times `vectors` [m, size], of what is `free` [n] and no gauge.
 
         Gauges are those at `values` [n].
         """
-        result = torch.zeros(len(vectors), self.size).double()
+        result = torch.zeros(vectors.shape).double()
         at = self._take(free).nonzero()[:, 0]
         if len(at):
             right = self._take(vectors)[:, at].T
@@ -212,15 +212,12 @@ class Numbers:
         matrix = matrix + least[at].diag() + tuning.DAMPING * matrix.diagonal().diag()
         # In units of their own curvature, numbers are of one size.
         unit = matrix.diagonal().rsqrt()[:, None]
-        basis = torch.eye(len(at)).double()
-        if self.gauges:
-            slopes = [gauge.slopes(numbers) for gauge in self.gauges]
-            forbidden = torch.cat(slopes, 1)[at] * unit
-            # What is orthogonal to the directions: the last columns of a complete basis.
-            rank = int(torch.linalg.matrix_rank(forbidden))
-            basis = torch.linalg.svd(forbidden)[0][:, rank:]
-        scaled = basis.T @ (matrix * unit * unit.T) @ basis
-        solution: Tensor = basis @ torch.linalg.solve(scaled, basis.T @ (right * unit)) * unit
+        slopes = [gauge.slopes(numbers)[at] * unit for gauge in self.gauges]
+        gauges = torch.cat([unit[:, :0], *slopes], 1)
+        forbidden = gauges @ torch.linalg.pinv(gauges)
+        rest = torch.eye(len(at)).double() - forbidden
+        scaled = rest @ (matrix * unit * unit.T) @ rest + forbidden
+        solution: Tensor = torch.linalg.solve(scaled, rest @ (right * unit)) * unit
         return solution
 
 

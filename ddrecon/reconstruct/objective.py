@@ -147,29 +147,31 @@ def fit_held_out(
         key: picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
         for key, default in RESPONSE.items()
     }
+    response = {key: value.expand(sizes.get(key, len(value))) for key, value in response.items()}
     exposure, offset = (response[key].view(-1, 1, 1) for key in ("exposure", "offset"))
     # A background behind the volume counts as if it were exposed with it.
     light = (picture - offset) / exposure
     basis = {"exposure": light, "offset": torch.ones_like(light)}
     weight = target.slope if target.seen is None else target.slope * target.seen
-    tried = [(picture, {key: response[key].expand(size) for key, size in sizes.items()})]
+    ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
+    tried = [(picture, response)]
     for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
-        if not sizes.keys() >= set(keys):
-            continue
-        # Least squares, weighed as the target's loss weighs small errors.
-        ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
-        columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
-        fixed = sum(response[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
-        matrix, right = (
-            (image * weight).double().cpu().flatten(-3) for image in (columns, target.image - fixed)
-        )
-        # A response that a picture does not show, such as the exposure of black, is 0.
-        solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
-        values = solution.to(light).split([sizes[key] for key in keys])
-        fit = response | dict(zip(keys, values, strict=True))
-        shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
-        tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
-    return max(tried, key=lambda attempt: float(target.psnr_of(attempt[0])))
+        if sizes.keys() >= set(keys):
+            # Least squares, weighed as the target's loss weighs small errors.
+            columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
+            fixed = sum(response[k].view(-1, 1, 1) * basis[k] for k in basis if k not in keys)
+            matrix, right = (
+                (image * weight).double().cpu().flatten(-3)
+                for image in (columns, target.image - fixed)
+            )
+            # A response that a picture does not show, such as the exposure of black, is 0.
+            solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
+            values = solution.to(light).split([sizes[key] for key in keys])
+            fit = response | dict(zip(keys, values, strict=True))
+            shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
+            tried.append((shown, fit))
+    fitted, best = max(tried, key=lambda attempt: float(target.psnr_of(attempt[0])))
+    return fitted, {key: best[key] for key in sizes}
 
 
 class NotFiniteError(Exception):
@@ -185,25 +187,21 @@ def explain_divergence(
     """
     reason, residual, advice = str(error), math.nan, ""
     if isinstance(error, SolveError):
-        residual = error.residual
-        reason = reason.partition(";")[0]
-        advice = f"{error.advice}, or "
-        if not math.isfinite(residual):
-            reason, advice = "the light is not finite", ""
+        reason, residual = reason.partition(";")[0], error.residual
+        if math.isfinite(residual):
+            advice = f"{error.advice}, or "
+        else:
+            reason = "the light is not finite"
     largest = list[str]()
     for p in parameters:
         values = p.value.detach()
-        index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
-        largest.append(
-            f"{_name_entry(p.name, index, p.is_field)} is {float(values[tuple(index)]):.4g}"
-        )
+        index = torch.unravel_index(values.abs().argmax(), values.shape)
+        name = _name_entry(p.name, [int(i) for i in index], p.is_field)
+        largest.append(f"{name} is {float(values[index]):.4g}")
     names = " and ".join(f"optimize.parameters.{p.name}" for p in parameters)
-    return DivergenceError(
-        iteration,
-        f"{reason}; at most, {'; '.join(largest)}",
-        residual,
-        f"{advice}give another start (init) or bounds (min, max) to {names}",
-    )
+    reason = f"{reason}; at most, {'; '.join(largest)}"
+    advice += f"give another start (init) or bounds (min, max) to {names}"
+    return DivergenceError(iteration, reason, residual, advice)
 
 
 def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:

@@ -124,12 +124,11 @@ class Schedule:
 
     def ending(self, count: int) -> dict[str, str]:
         """Why a run of `count` iterations ended: the kind, and in words."""
-        if self.progress.ended == "noise":
-            return {"kind": "noise", "text": "ended: images are explained within noise"}
-        if self.progress.ended:
-            text = f"the loss can fall by less than {tuning.REST:.1%} of itself"
-            return {"kind": "rest", "text": f"ended: {text}"}
-        if self.is_auto:
-            text = f"{self.most} iterations are the most that auto makes, though the loss fell"
-            return {"kind": "bound", "text": f"ended: {text}"}
-        return {"kind": "iterations", "text": f"ended: {count} iterations were asked for"}
+        kind = self.progress.ended or ("bound" if self.is_auto else "iterations")
+        texts = {
+            "noise": "images are explained within noise",
+            "rest": f"the loss can fall by less than {tuning.REST:.1%} of itself",
+            "bound": f"{self.most} iterations are the most that auto makes, though the loss fell",
+            "iterations": f"{count} iterations were asked for",
+        }
+        return {"kind": kind, "text": f"ended: {texts[kind]}"}

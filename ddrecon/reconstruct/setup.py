@@ -133,15 +133,12 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
             "lights: none shines, and none is optimized: give one a brightness above 0,"
             " or the volume an emission"
         )
-    variables = variable_names(train)
     problems = [
         f"optimize.parameters.{name}: there is no training view of this name with an image"
-        for name in settings.parameters
-        if name not in variables
+        for name in sorted(settings.parameters.keys() - variable_names(train))
     ]
     for view in train.views:
-        place = describe_flaw("the image", target_of(view), is_field=False)
-        if place is not None:
+        if place := describe_flaw("the image", target_of(view), is_field=False):
             problems.append(f"views.{view.name}: {place} is not finite")
     if problems:
         raise SceneError(problems)
@@ -172,21 +169,17 @@ def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
     encoded = [view.name for view in train.views if view.step]
     linear = [view.name for view in train.views if not view.step]
     if encoded and linear:
-        encoded_names, linear_names = (
-            ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-            for names in (encoded, linear)
-        )
         raise SceneError(
-            f"optimize.loss: some training pictures are sRGB files ({encoded_names}), others linear"
-            f" ({linear_names}); say how to compare them, loss: display or loss: l2"
+            f"optimize.loss: some training pictures are sRGB files ({encoded[0]}), others linear"
+            f" ({linear[0]}); say how to compare them, loss: display or loss: l2"
         )
     return "display" if encoded else "l2"
 
 
 def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
-    """The noise of the picture of `view`, as its scene says, by the view or for all."""
+    """The noise of the picture of `view`, as its scene says."""
     noise = settings.noise
-    return view.noise or (Noise(noise.read, noise.shot, view.step) if noise else None)
+    return Noise(noise.read, noise.shot, view.step) if noise else None
 
 
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
@@ -221,7 +214,7 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         Parameter(name, settings.parameters[name], start, scene.volume.grid, unit_of(started, name))
         for name, start in starts.items()
     ]
-    fields = [parameter for parameter in parameters if parameter.is_field]
+    fields = [p for p in parameters if p.is_field]
     if len(fields) == 1 and settings.parameters[fields[0].name].tv is None:
         fields[0].tv *= kind_of(fields[0].name).alone
     return parameters

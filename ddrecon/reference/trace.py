@@ -133,15 +133,9 @@ class Traced:
         return math.sqrt(max(0.0, self.distance(image) ** 2 - self.noise**2))
 
 
-def least_error(noise: float) -> float:
-    """What an error must exceed to be told from none, by a reference of this `noise`."""
-    return noise / 3
-
-
 def error_text(error: float, noise: float) -> str:
     """`error` against a reference of this `noise`, with "<" where it cannot be told from none."""
-    least = least_error(noise)
-    return f"{error:.3g}" if error >= least else f"< {least:.2g}"
+    return f"{error:.3g}" if error >= noise / 3 else f"< {noise / 3:.2g}"
 
 
 def _power(image: np.ndarray) -> float:

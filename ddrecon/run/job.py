@@ -14,8 +14,9 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from statistics import mean
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -26,6 +27,7 @@ from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.io.files.folders import Folder
 from ddrecon.progress import BAR, bar_settings, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
 CHECKPOINTS, LAST, PREVIOUS = "checkpoints", "last.pt", "previous.pt"
@@ -46,35 +48,42 @@ Outcome = tuple[dict[str, Any], list[str]]
 """What a command has to tell: a record, of plain values by key, and the same as lines."""
 
 
-class Job(Protocol):
-    """What is made by iterations, so many in `total` where that is known.
+class Job:
+    """Iterations of a `run`, of one scene or of several together; frames, experiments are others.
 
     Its bar has a `title`; what it finds is a `result_of` these plain values.
     """
 
-    title: str
-    result_of: Mapping[str, Any]
+    def __init__(self, run: Reconstruction, title: str, result_of: Mapping[str, Any]):
+        self.run, self.title, self.result_of = run, title, result_of
 
     @property
     def iteration(self) -> int:
         """How many iterations are made."""
+        return self.run.iteration
 
     @property
     def total(self) -> int | None:
-        """How many iterations there are to be."""
+        """How many iterations there are to be, where that is known."""
+        schedule = self.run.schedule
+        return None if schedule.is_auto else schedule.most
 
     @property
     def is_done(self) -> bool:
         """Whether no iteration is left."""
+        return self.run.is_done
 
     def step(self) -> str:
         """Makes an iteration; what a progress bar says of it."""
+        return f"PSNR {mean(row.psnr for row in self.run.advance()):.1f} dB"
 
     def state(self) -> dict[str, Any]:
         """Tensors and plain values that `restore` goes on from, to the same bits."""
+        return self.run.state()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where `state` was."""
+        self.run.restore(state)
 
     def begin(self, folder: Folder, is_resumed: bool) -> None:
         """Prepares the folder; what an earlier job has left there goes, or `is_resumed`."""
@@ -83,6 +92,7 @@ class Job(Protocol):
 
     def finish(self) -> Outcome:
         """Writes what was found to the folder, and tells it."""
+        raise NotImplementedError
 
 
 def work(job: Job, folder: Folder | None, is_resumed: bool) -> Outcome:

@@ -32,8 +32,9 @@ from ddrecon.reconstruct.setup import choose_loss, targets_of
 from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings
+from ddrecon.terms import THINNEST
 from ddrecon.variables.kinds import is_of_volume, pose_change
-from ddrecon.variables.values import extinction_of, fields_of, value_of, with_values
+from ddrecon.variables.values import extinction_of, value_of, with_values
 
 STEPS = 8
 """The most steps; they end when one improves nothing."""
@@ -106,13 +107,14 @@ def _find_truths(scene: Scene) -> dict[str, Tensor]:
 
     Fields that are the same in every cell are left out.
     """
-    truths = {}
-    for name, start in scene.starts.items():
-        if is_of_volume(name) and (value := value_of(scene, name)).ndim >= 3:
-            is_start = start.shape == value.shape and torch.equal(start, value)
-            if not is_start and bool((value != value.flatten()[0]).any()):
-                truths[name] = value
-    return truths
+    values = {name: value_of(scene, name) for name in scene.starts if is_of_volume(name)}
+    return {
+        name: value
+        for name, value in values.items()
+        if value.ndim >= 3
+        and not torch.equal(value, scene.starts[name])
+        and bool((value != value.flatten()[0]).any())
+    }
 
 
 def describe_loss(settings: OptimizeSettings, train: Scene) -> dict[str, Any]:
@@ -228,8 +230,9 @@ def find_empty(scene: Scene, iteration: int, gain: float) -> str | None:
 
     Of a run that cannot see any smoke, for its lights, cameras or masks, the scene is refused.
     """
-    shining = [v for n, v in fields_of(scene).items() if n.endswith(("density", "emission"))]
-    if any(bool(value.any()) for value in shining):
+    volume = scene.volume
+    depth = float((extinction_of(volume).amax(0) * volume.density).max()) * max(volume.grid.extent)
+    if depth > THINNEST or (volume.emission is not None and bool(volume.emission.any())):
         return None
     if gain == math.inf:
         reason = f"the run ended after {iteration} iterations, before anything moved"

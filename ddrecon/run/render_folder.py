@@ -19,7 +19,6 @@ from ddrecon.extras import advice, load_for_file
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
 from ddrecon.io.images.table import (
-    NO_LAYERS,
     PREVIEW,
     read_image,
     write_animation,
@@ -137,7 +136,8 @@ def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: 
             seconds[view.name] = elapsed
             slopes = {n.removeprefix(GRADIENT): images.pop(n) for n in names if GRADIENT in n}
             files[view.name] = _write_images(folder / view.name, images)
-            files[view.name] += _write_slopes(folder / f"{view.name}{GRADIENT}", slopes, scales)
+            if slopes:
+                files[view.name] += _write_images(folder / (view.name + GRADIENT), slopes, scales)
             if view.image is not None:
                 target = Target.of(view.image, view.mask, "display" if view.step else "l2")
                 quality[view.name] = float(target.psnr_of(images[""]))
@@ -203,12 +203,17 @@ def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
 
 
 def _write_images(
-    stem: Path, images: Mapping[str, Tensor], previews: Mapping[str, np.ndarray] = NO_LAYERS
+    stem: Path, images: Mapping[str, Tensor], scales: dict[str, float] | None = None
 ) -> list[str]:
     """The names of files of the image called "" and of its components, layers of one .exr.
 
-    Every component is an array as well and, but for the depth, a preview, its own or of `previews`.
+    Every component is an array as well and, but for the depth, a preview. Where these are signed,
+    the values of full red are added to `scales`.
     """
+    previews = dict[str, np.ndarray]()
+    if scales is not None:
+        for name, image in images.items():
+            previews[name], scales[stem.name + name] = diverging(image)
     arrays, layers, written = {name: pixels(i) for name, i in images.items()}, {}, list[Path]()
     picture = arrays.pop("")
     if MATTE[0] in arrays:
@@ -224,15 +229,6 @@ def _write_images(
             write_preview(written[-1], previews.get(name, array))
     written = write_picture(stem, picture, previews.get(""), layers) + written
     return [path.name for path in written]
-
-
-def _write_slopes(stem: Path, slopes: Mapping[str, Tensor], scales: dict[str, float]) -> list[str]:
-    """As `_write_images`, of derivatives, if any; the values of full red are added to `scales`."""
-    if not slopes:
-        return []
-    diverged = {name: diverging(slope) for name, slope in slopes.items()}
-    scales |= {stem.name + name: full for name, (_, full) in diverged.items()}
-    return _write_images(stem, slopes, {name: preview for name, (preview, _) in diverged.items()})
 
 
 def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> float:

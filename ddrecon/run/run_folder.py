@@ -54,36 +54,7 @@ LENGTHS = "sigma_t [1/u], where [u] is the unit of length of the grid"
 """What a file says of the units of lengths; density times sigma_t is the extinction."""
 
 
-class Iterations(Job):
-    """The job of a `run`: that of a scene, or of several together."""
-
-    def __init__(self, run: Reconstruction, title: str, result_of: Mapping[str, Any]):
-        self.run, self.title, self.result_of = run, title, result_of
-
-    @property
-    def iteration(self) -> int:
-        return self.run.iteration
-
-    @property
-    def total(self) -> int | None:
-        schedule = self.run.schedule
-        return None if schedule.is_auto else schedule.most
-
-    @property
-    def is_done(self) -> bool:
-        return self.run.is_done
-
-    def step(self) -> str:
-        return f"PSNR {mean(row.psnr for row in self.run.advance()):.1f} dB"
-
-    def state(self) -> dict[str, Any]:
-        return self.run.state()
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self.run.restore(state)
-
-
-class Run(Iterations):
+class Run(Job):
     """The job of reconstructing the `scene` of a `scene_file` in an `environment`.
 
     Pictures are written each `preview_every` iterations; a `frame` of a film, which this names,

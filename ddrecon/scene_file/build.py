@@ -313,16 +313,14 @@ def _fill(
     scene_file: SceneFile, key: str, name: str, init: float | tuple[float, ...], value: Tensor
 ) -> Tensor:
     """`value` with every entry `init`, or every color or component its own."""
-    kind = kind_of(name)
+    kind, numbers = kind_of(name), value.new_tensor(init)
     count = len(component_names(name, value)) if kind.components else 0
-    if isinstance(init, float):
-        if not count:
-            return torch.full_like(value, init)
-    elif kind.is_color and len(init) == 3:
-        colors = value.new_tensor(init).view(-1, *[1] * (value.ndim - 1))
-        return colors.expand(3, *value.shape[1:]).clone()
-    elif len(init) == (count or value.shape[:1].numel()) and value.ndim == 1 and not kind.is_color:
-        return value.new_tensor(init)
+    if not (numbers.ndim or count):
+        return numbers.expand_as(value).clone()
+    if kind.is_color and numbers.shape == (3,):
+        return numbers.view(-1, *[1] * (value.ndim - 1)).expand(3, *value.shape[1:]).clone()
+    if numbers.shape == value.shape and numbers.ndim == 1 and not kind.is_color:
+        return numbers
     expected = f"a list of {count} numbers" if count else "one number"
     expected += " or [r, g, b]" if kind.is_color else ""
     length = f", found a list of {len(init)}" if isinstance(init, tuple) else ""

@@ -32,7 +32,6 @@ from ddrecon.hull import HullError, bound_smoke, find_shown
 from ddrecon.io.images.films import FILMS, frame_times, nearest_frame
 from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.march.samplers import cross_box
-from ddrecon.pictures import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
 from ddrecon.scene_file.schema import Bounds, SceneTree
@@ -154,7 +153,6 @@ def _build_view(maker: Maker, index: int) -> View:
     if background is None and isinstance(section.background, float | tuple):
         background = maker.tensor(section.background).view(-1, 1, 1)
     lens = None if camera.distortion is None else maker.tensor(camera.distortion)
-    noise = section.noise
     return View(
         section.name,
         replace(camera, pose=maker.tensor(camera.pose), distortion=lens),
@@ -166,7 +164,6 @@ def _build_view(maker: Maker, index: int) -> View:
         None if section.offset == 0 else maker.tensor(section.offset).view(-1),
         background,
         step,
-        None if noise is None else Noise(noise.read, noise.shot, step),
     )
 
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from ddrecon.grid import Triple
 from ddrecon.records import Violation, bounded, one_of
-from ddrecon.settings import MOST_AROUND, NoiseSettings
+from ddrecon.settings import MOST_AROUND
 
 Color = float | Triple
 Size = tuple[int, int]
@@ -145,7 +145,6 @@ class ViewSection:
     offset: And this is added: a black level, or haze of the lens.
     background: What the picture shows where the volume is empty: a picture without it, or a color.
         Unless given, the lights behind it, or black.
-    noise: How this picture errs; see `optimize.noise` below.
     """
 
     name: str = ""
@@ -159,7 +158,6 @@ class ViewSection:
     exposure: Color = bounded(1.0, minimum=1e-3)
     offset: Color = 0.0
     background: Backdrop | None = None
-    noise: NoiseSettings | None = None
 
     def violations(self) -> Iterator[Violation]:
         if self.name and not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{,199}", self.name):

@@ -23,9 +23,8 @@ from ddrecon.light.moments import Cut, add, cut, join, mean_and_first
 from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
-from ddrecon.numerics.harmonics import count_harmonics
-from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.numerics.sphere import count_harmonics, sphere_quadrature
 from ddrecon.transport.characteristics import Characteristic
 from ddrecon.transport.mirror import Mirror
 from ddrecon.transport.sweep import count_directions, sweep_change, sweep_rule

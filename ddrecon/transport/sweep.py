@@ -17,10 +17,9 @@ from ddrecon.grid import Grid
 from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill, join
 from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.layout import NEARLY, apply_around
-from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import constant
+from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
 from ddrecon.transport.mirror import Mirror
 

@@ -30,15 +30,14 @@ from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.light_field import fluence_of, multiply_scatters
 from ddrecon.lighting import solve_light
-from ddrecon.march.direct import Beamed, shine_on, transmittance
-from ddrecon.march.ground import LitGround
+from ddrecon.march.ground import Beamed, LitGround, shine_on, transmittance
 from ddrecon.medium.coefficients import Medium, keep_medium, refine_medium, remaining_moments
 from ddrecon.medium.optics import reflectance, transmitted_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.transport.bounced import TURNS, follow_inside
 from ddrecon.transport.characteristics import Characteristic, radiance_along
+from ddrecon.transport.mirror import TURNS, follow_inside
 from ddrecon.transport.rounds import face_mirror
 from ddrecon.transport.sweep import DIRECTIONS, emitted_light, steep_gradient, sweep_rule
 

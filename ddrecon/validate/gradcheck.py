@@ -216,7 +216,7 @@ def loss_at(scene: Scene, point: Values, generator: torch.Generator) -> Loss:
         image = view.image
         if image is None:
             image = random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
-        targets[view.name] = Target.of(image, view.mask, kind, view.noise)
+        targets[view.name] = Target.of(image, view.mask, kind)
 
     @functools.cache
     def light_at_point() -> LightField:

@@ -407,12 +407,11 @@ def _require_range(name: str, value: Tensor) -> None:
     range_found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
     if not math.isfinite(least + most):
         raise UsageError(f"{name}: must be finite, {range_found}")
-    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
-        # A scene may scatter further forward than a run makes it.
-        raise UsageError(f"{name}: must be above -1 and below 1, {range_found}")
-    if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
-        bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
-        raise UsageError(f"{name}: must be {bounds}, {range_found}")
+    limits, is_legal = kind.limits, kind.allows(value)
+    if kind.high == STEEPEST_G:  # a scene may scatter further forward than a run makes it
+        limits, is_legal = "above -1 and below 1", -1 < least <= most < 1
+    if not is_legal:
+        raise UsageError(f"{name}: must be {limits}, {range_found}")
     if kind.is_direction and least == most == 0:
         raise UsageError(f"{name}: must not be zero")
 

@@ -14,7 +14,7 @@ from test_optimize_command import press_ctrl_c_in
 from ddrecon.cli.commands import main
 from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field
-from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty import Uncertainty
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]

@@ -10,11 +10,11 @@ import pytest
 from click.testing import CliRunner
 
 from ddrecon import bench
+from ddrecon.bench import CASES
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene import Scene
-from ddrecon.validate.hard import CASES
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 

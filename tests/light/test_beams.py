@@ -36,7 +36,7 @@ from ddrecon.medium.coefficients import (
     scale_medium,
     unturned_moments,
 )
-from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.sphere import sphere_quadrature
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -79,9 +79,9 @@ def test_where_rays_run_through_centers_the_mass_is_that_of_the_cells_behind(dir
 
 
 @pytest.mark.parametrize("direction", SLANTED, ids=str)
-@pytest.mark.parametrize("slope", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.7)], ids=["even", "linear"])
-def test_in_an_even_or_linear_field_the_mass_is_that_of_each_ray(direction, slope):
+def test_in_a_linear_field_the_mass_is_that_of_each_ray(direction):
     """Where no ray comes within two cells of the sides: interpolation of both is exact there."""
+    slope = tensor(0.4, -0.3, 0.7)
     grid, travel = Grid((11, 12, 11), (0, 0, 0), (1.0, 1.2, 0.9)), unit(direction)
     last = travel.new_tensor(grid.shape) - 1
     index = torch.stack(torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij"), -1).double()
@@ -90,20 +90,14 @@ def test_in_an_even_or_linear_field_the_mass_is_that_of_each_ray(direction, slop
     axis = int(speed.abs().argmax())
     step, moved = 1 / speed[axis].abs(), speed / speed[axis].abs()
     count = (index if travel[axis] > 0 else last - index)[..., axis, None]
-    entered, _ = sum_mass_to_cells((20 + index @ tensor(*slope))[None], grid, travel)
-    mean = 20 + (index - (count + 1) / 2 * moved) @ tensor(*slope)
+    entered, _ = sum_mass_to_cells((20 + index @ slope)[None], grid, travel)
+    mean = 20 + (index - (count + 1) / 2 * moved) @ slope
     wanted, first = step * count[..., 0] * mean, index - count * moved
     sides = [other for other in range(3) if other != axis]
     ends = torch.stack([index, first, last - index, last - first])[..., sides]
     is_within = ends.amin((0, -1)) >= 2
     assert int(is_within.sum()) > 100
     torch.testing.assert_close(entered[0][is_within], wanted[is_within], rtol=1e-13, atol=0)
-
-
-def mass_to_centers(field: Tensor, grid: Grid, direction: Tensor) -> Tensor:
-    """The integral of `field` [z, y, x] from the box to each cell's center."""
-    entered, step = sum_mass_to_cells(field[None], grid, direction)
-    return entered[0] + 0.5 * step * field
 
 
 @pytest.mark.parametrize("direction", [*SLANTED, (0.9, 0.2, 0.02), (1.0, 1.0, 1.0)], ids=str)
@@ -123,7 +117,9 @@ def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[flo
     # Rays that enter more than a slice later count as if they entered then.
     for through, size, part in zip(ways, grid.spacing, travel, strict=True):
         same &= through > 2 * size / part.abs()
-    mass = mass_to_centers(torch.full(grid.shape, 3.0, dtype=torch.float64), grid, travel)
+    field = torch.full((1, *grid.shape), 3.0, dtype=torch.float64)
+    entered, step = sum_mass_to_cells(field, grid, travel)
+    mass = (entered + 0.5 * step * field)[0]
     assert int(same.sum()) > 100
     torch.testing.assert_close(mass[same], 3 * way[same], rtol=1e-13, atol=0)
 
@@ -320,10 +316,6 @@ def medium_in(
     return scale_medium(Volume(grid, density, sigma_a, sigma_s, density.new_tensor(g)))
 
 
-def unscattered_ambient(medium: Medium, radiance: Tensor) -> Tensor:
-    return sum_unscattered_sky(medium, [ambient_sky(radiance)], degree=1)
-
-
 def received(grid: Grid, density: Tensor, lights: list, **medium) -> Tensor:
     return receive_light(medium_in(grid, density, **medium), lights, degree=1).source
 
@@ -375,7 +367,8 @@ def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
     grid = Grid((cells, 9, 9), (0, -1e3, -1e3), (thickness, 1e3, 1e3))
     density = torch.ones(grid.shape, dtype=torch.float64)
     medium = medium_in(grid, density, g=0.0, sigma=([0.3], [1.7]))
-    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
+    sky = ambient_sky(torch.ones(1, 1, 1, 1, dtype=torch.float64))
+    light = sum_unscattered_sky(medium, [sky], degree=1)
     directions, weights = sphere_quadrature(light)
     along_z, _, _ = flux_along_axes(light[1:])
     for cell in range(cells):

@@ -14,8 +14,7 @@ from ddrecon.light.moments import (
     radiance_along,
     weigh,
 )
-from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 
 DTYPES = [torch.float32, torch.float64]
 

@@ -5,13 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from media import (
-    assert_image_derivatives,
-    box_grid,
-    make_camera,
-    make_scene,
-    random_values,
-)
+from media import assert_image_derivatives, box_grid, make_camera, make_scene, random_values
 from scenes import VIEWS
 from torch import Tensor
 

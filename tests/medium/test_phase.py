@@ -15,10 +15,10 @@ from ddrecon.medium.phase import (
     HenyeyGreenstein,
     PhaseFunction,
     Rayleigh,
+    SeenPhase,
     Tabulated,
     TwoLobe,
 )
-from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import tensors_in
 from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.picture import render

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from ddrecon.numerics.harmonics import harmonics
-from ddrecon.numerics.quadrature import DEGREES, sphere_quadrature
 from ddrecon.numerics.series import (
     STEPS,
     angle_of,
@@ -19,6 +17,7 @@ from ddrecon.numerics.series import (
     look_up,
     with_slopes,
 )
+from ddrecon.numerics.sphere import DEGREES, harmonics, sphere_quadrature
 
 degrees = pytest.mark.parametrize("degree", [0, 1, 3, 5, 7])
 

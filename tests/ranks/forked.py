@@ -30,7 +30,7 @@ from ddrecon.cli import main
 from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction
 
-for name in ("cli.session", "run.render_folder", "terms", "uncertainty.experiments"):
+for name in ("cli.session", "run.render_folder", "terms", "uncertainty"):
     import_module(f"ddrecon.{name}")
 PIL.Image.init()
 ask_python(everything=False)

@@ -8,10 +8,10 @@ import torch
 from ddrecon.cameras import CELL, Camera, cast_rays, cell_width
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import resample
-from ddrecon.pictures import Noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.setup import factors, scene_at_level
+from ddrecon.settings import NoiseSettings
 
 
 def test_coarsening_keeps_the_mass(ball_scene) -> None:
@@ -62,12 +62,12 @@ def test_pixels_that_do_not_count_are_in_no_average(ball_scene) -> None:
 
 def test_noise_of_averaged_pictures_is_less(ball_scene) -> None:
     """The loss that given noise explains is that of pictures with such noise, at each level."""
-    noise = Noise(0.03, 0.0)
     view = ball_scene.views[0]
-    black = replace(view, image=torch.zeros(3, 96, 96), noise=noise, mask=None)
+    settings = replace(ball_scene.optimize, noise=NoiseSettings(read=0.03))
+    black = replace(view, image=torch.zeros(3, 96, 96), mask=None)
     black = replace(black, camera=replace(view.camera, size=(96, 96)))
     noisy = replace(black, image=0.03 * torch.randn(3, 96, 96, generator=torch.manual_seed(0)))
-    frame = Frame(replace(ball_scene, views=[noisy]), None)
+    frame = Frame(replace(ball_scene, views=[noisy], optimize=settings), None)
     for level in range(len(frame.problem.factors)):
         frame.enter(level)
         (shown,) = frame.level.train.views

@@ -15,7 +15,7 @@ from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.slow
 EYES = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}

@@ -124,7 +124,7 @@ def test_why_a_volume_is_empty_is_told(gain: float, advice: str) -> None:
     """Nothing else is: what is not there is neither overfit nor seen from a wrong side."""
     scene = make_scene()
     views = [replace(view, is_test=view.name == "ring_01") for view in scene.views]
-    nothing = with_values(replace(scene, views=views), {"density": 0 * scene.volume.density})
+    nothing = with_values(replace(scene, views=views), {"density": 1e-7 * scene.volume.density})
     (told,) = diagnose(findings_of(nothing), 3, gain)
     assert told["kind"] == "empty" and advice in told["text"]
     glowing = replace(scene.volume, density=nothing.volume.density, emission=torch.ones(1, 8, 8, 8))

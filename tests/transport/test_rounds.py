@@ -9,6 +9,8 @@ import torch
 from media import count_kept, half_empty, make_scene
 from torch import Tensor
 
+from ddrecon.bench import ball as hard_ball
+from ddrecon.bench import layer
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
@@ -24,8 +26,6 @@ from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.transport.rounds import run_rounds
 from ddrecon.transport.sweep import emitted_light, steep_gradient, sweep
-from ddrecon.validate.hard import ball as hard_ball
-from ddrecon.validate.hard import layer
 
 CUBES = (1.0, 1.0, 1.0)
 

@@ -62,7 +62,7 @@ def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
 
 def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
-    is_begun = any(out.glob("checkpoints/[lp]*.pt"))  # not one half written
+    is_begun = (out / "checkpoints/last.pt").is_file()
     going_on = ["--resume"] if is_begun else ["--overwrite"]
     scene, how = str(folder / "scene.yaml"), ["-q", "--preview-every", "4"]
     main(["optimize", scene, *how, "-o", str(out), *going_on, *NUMBERS])
@@ -80,14 +80,15 @@ def result_of(out: Path) -> dict[str, object]:
     log = [row[:seconds] + row[seconds + 1 :] for row in rows]
     files = [*sorted(out.glob("previews/*")), out / "parameters.json"]
     search = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]["search"]
-    pairs = [(n, v) for pair in search["pairs"] for part in pair for n, v in part.items()]
-    tensors = {name: [value, search["direction"][name]] for name, value in search["values"].items()}
-    for name, value in pairs:
-        tensors[name].append(value)
+    tensors = [
+        search["values"],
+        search["direction"],
+        *(x for pair in search["pairs"] for x in pair),
+    ]
     return {
         "log": log,
         "files": {path.name: path.read_bytes() for path in files},
-        "tensors": {name: [each.tolist() for each in found] for name, found in tensors.items()},
+        "tensors": [tensor.tolist() for tensor in tensors],
     }
 
 

@@ -17,7 +17,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.experiments import RATIO, Field, Uncertainty, mean_around
+from ddrecon.uncertainty import RATIO, Field, Uncertainty, mean_around
 
 SHAPE = (12, 14, 10)
 GRID = Grid(SHAPE, (0.0, 0.0, 0.0), (1.2, 1.4, 1.0))

@@ -11,14 +11,23 @@ import torch
 from click.testing import Result
 
 from ddrecon import bench
-from ddrecon.bench import Shot, bench_lines, row_of, shoot
+from ddrecon.bench import (
+    CASES,
+    TOLERANCE,
+    HardCase,
+    Shot,
+    balance_of,
+    bench_lines,
+    find_failures,
+    row_of,
+    run_case,
+    shoot,
+)
 from ddrecon.diffusion import solve
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import MissingExtraError
 from ddrecon.picture import render
 from ddrecon.reference.trace import Traced
-from ddrecon.validate import hard
-from ddrecon.validate.hard import CASES, TOLERANCE, HardCase, balance_of, find_failures, run_case
 
 Run = Callable[..., Result]
 CPU = torch.device("cpu")
@@ -44,7 +53,7 @@ def test_a_hard_case_keeps_its_bounds(name: str):
 @pytest.mark.parametrize(("numbers", "failures"), BROKEN)
 def test_each_broken_bound_is_told(numbers: dict[str, float], failures: list[str]):
     """And no bound that is kept: residuals may be what rounding makes of them."""
-    assert find_failures(dict.fromkeys(hard.NUMBERS, 0.0) | numbers) == failures
+    assert find_failures(dict.fromkeys(bench.NUMBERS, 0.0) | numbers) == failures
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
@@ -66,7 +75,7 @@ def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
 
 @pytest.mark.slow
 def test_hard_cases_pass_unless_a_solve_gives_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hard, "CASES", {"vacuum": HardCase(torch.zeros), "small": SMALL})
+    monkeypatch.setattr(bench, "CASES", {"vacuum": HardCase(torch.zeros), "small": SMALL})
     result = run("bench", "--hard", "-q", "-o", "out", "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(Path("report.json").read_text())
@@ -82,7 +91,7 @@ def test_hard_cases_pass_unless_a_solve_gives_up(run: Run, monkeypatch: pytest.M
 
 def test_the_gradient_is_the_slope_of_the_mean_of_the_image() -> None:
     """Along density itself, by a central difference."""
-    plume = hard.plume_scene(8, 4, torch.float64, CPU)
+    plume = bench.plume_scene(8, 4, torch.float64, CPU)
 
     def mean(factor: float) -> float:
         volume = replace(plume.volume, density=factor * plume.volume.density)

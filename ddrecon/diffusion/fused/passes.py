@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any
 
 import torch
@@ -22,22 +22,13 @@ from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Pas
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import TensorSteps
 from ddrecon.kernels.launch import launch_later, thread_count
-from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.kernels.text import PACKAGE, Bound, TextKernel, declarations, members_of
 from ddrecon.numerics.remember import may_read
 
-Kind = IntEnum(
-    "Kind",
-    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT DESCEND ASCEND SOLVE TURN PRODUCT "
-    "ADVANCE",
-    start=0,
-)
-"""What a pass does, as `passes.h` has it."""
-PASS = """
-long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-long u, source, out, numbers, sums, steps, axes[3];
-F *c[3], *loss, *inverse, *coupling, *below, *above, *belows[3], *aboves[3], *results[6]
-"""
-"""What a pass is given, as `passes.h` declares it: eight bytes each."""
+HEADER = "diffusion/fused/passes.h"
+_KINDS = (PACKAGE / HEADER).read_text(encoding="utf-8").split("enum Kind {")[1].split("}")[0]
+KIND = {name: number for number, name in enumerate(re.findall(r"\w+", _KINDS))}
+"""What passes do, by name."""
 TOGETHER = 400
 """Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
@@ -97,7 +88,7 @@ class KernelPasses(Passes):
 
     def run(self) -> None:
         # Nothing depends on scales: a GPU finds those of all grids at once, at the end.
-        self.rows.sort(key=lambda row: row["kind"] == Kind["SCALE"])
+        self.rows.sort(key=lambda row: row["kind"] == KIND["SCALE"])
         program, nothing = Program(self, "prepare"), self.like.new_empty(1)
         program.run(program.bind(nothing, nothing), 0)
 
@@ -178,7 +169,7 @@ class KernelPasses(Passes):
     ) -> None:
         """Lists a pass over all of `shape` [C, z, y, x]; `width`: of an item, None for a slice."""
         width = 1 if self.like.is_cuda else width or shape[2] * shape[3]
-        row: dict[str, Any] = {"kind": Kind[kind], "items": math.prod(shape) // width}
+        row: dict[str, Any] = {"kind": KIND[kind], "items": math.prod(shape) // width}
         row |= {"width": width, "n": shape[1:], "face_colors": 1}
         if operator:
             row |= {"c": operator.conductances, "loss": operator.loss}
@@ -237,7 +228,7 @@ class Program:
     def __init__(self, passes: KernelPasses, name: str, steps: Sequence[int] = (0,)):
         like, self.size, rows = passes.like, passes.size, passes.rows
         self.kernel, self.tensors = passes_kernel(name, 8 * like.itemsize), passes.tensors
-        names = [*entries_of(PASS)]
+        names = [*entries_of(members_of(HEADER, "Pass"))]
         self.table = _write_table([row.get(name, 0) for row in rows for name in names], like)
         # So many cells of all colors are best done by one thread for each color.
         most = -1 if like.is_cuda else SMALL
@@ -267,7 +258,7 @@ def _list_launches(
     launches = list[dict[str, int]]()
     for number, row in enumerate(rows[first:last], first):
         is_large = row["items"] * row["width"] > most
-        if number > first and row["kind"] == rows[number - 1]["kind"] == Kind["SCALE"] and most < 0:
+        if number > first and row["kind"] == rows[number - 1]["kind"] == KIND["SCALE"] and most < 0:
             launches[-1]["end"] = number + 1
             continue
         if launches and launches[-1]["shares"] and not is_large:
@@ -294,8 +285,7 @@ def passes_kernel(name: str, bits: int) -> TextKernel:
     }}
     """
     declared = "long *table; int begin, end, shares; F *work, *solution"
-    header = "diffusion/fused/passes.h"
-    return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", header)
+    return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", HEADER)
 
 
 def name_kernels(like: Tensor) -> None:

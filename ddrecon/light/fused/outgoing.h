@@ -15,7 +15,7 @@ template <int L, int M> constexpr double NORM =
     find_root((M ? 2 : 1) * (2 * L + 1) * factorial(L - M) / factorial(L + M));
 template <int M> constexpr double ODD = factorial(2 * M) / (factorial(M) * (1 << M));
 
-// y_k of a vector v, z first, from those of order M and degree L on (`numerics/harmonics.py`):
+// y_k of a vector v, z first, from those of order M and degree L on (`numerics/sphere.py`):
 // `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `below` that of L - 1.
 template <class F, int DEGREE, int M, int L, class N> INLINE void fill_order(
     const N* v, const N& square, const N& cosine, const N& sine, const N& legendre, const N& below,

@@ -9,15 +9,11 @@ from typing import NamedTuple
 
 import torch
 
-from ddrecon.kernels.text import TextKernel, names_of
+from ddrecon.kernels.text import TextKernel, members_of, names_of
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.phase_peak import count_powers, is_scaled
+from ddrecon.medium.phase import count_powers, is_scaled
 
-_ARGUMENTS = """
-F *planes, *rays, *angles, *numbers, *table, *fronts; int *slices, *walked, *dealt;
-int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
-"""
 _CHANGES = "F *d_rays, *d_angles, *d_numbers, *d_table, *d_fronts"
 
 
@@ -152,7 +148,8 @@ def _kernel(
     name: str, layout: Layout, lists: int, text: str, declared: str, outputs: str, header: str
 ) -> TextKernel:
     """The kernel of `text`, which has `arguments`; with so many `lists` of fields."""
-    shared = f"{_ARGUMENTS} F *fields[{lists * layout.channels}];"
+    members = members_of("march/fused/rays.h", "Arguments")
+    shared = f"{members} F *fields[{lists * layout.channels}];"
     record = f"const Arguments<F> arguments = {{{names_of(shared)}}};"
     path = f"march/fused/{header}.h"
     return TextKernel(name, layout.bits, record + text, shared + declared, outputs, path)

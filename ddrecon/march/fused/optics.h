@@ -3,7 +3,7 @@
 #include "ddrecon/kernels/packets.h"
 // The formulas of the view-ray integral for packets: those of `numerics/decay.py`,
 // `numerics/series.py`, `light/point_light.py` and
-// `medium/phase_peak.py`, whose constants these are.
+// `medium/phase.py`, whose constants these are.
 
 namespace ddrecon {
 

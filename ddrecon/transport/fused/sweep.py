@@ -20,21 +20,14 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
 from ddrecon.kernels.launch import count_shares, launch_later
-from ddrecon.kernels.text import TextKernel, names_of
+from ddrecon.kernels.text import TextKernel, members_of, names_of
 from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
-GIVEN = (
-    "int *teams, *ordinates; F *paths, *values, *weighted, *extinction, *gradient, *source,"
-    "*d_extinction, *d_gradient, *d_source, *bars, *entering, *light, *returning, *scratch,"
-    "*outputs, *sums, *gradient_bar, *extinction_bar; int depth, height, width, periodic, count,"
-    "colors, planes, back_planes, pitch, room, first, launched, team, color, together, lanes,"
-    "begin, end"
-)
-"""What the struct `Sweep` of `ordinates.h` holds."""
-MADE = "light returning scratch outputs sums gradient_bar extinction_bar"
-"""What of that kernels write."""
+HEADER = "transport/fused/ordinates.h"
+WRITTEN = "light returning scratch outputs sums gradient_bar extinction_bar"
+"""What of the struct `Sweep` kernels write."""
 TABLES = "teams", "ordinates", "paths", "values", "weighted"
 VECTOR = 16
 """Rows of numbers begin at multiples of so many."""
@@ -232,11 +225,12 @@ class _ByCells(_Launches):
 @functools.cache
 def _kernel(run: str, is_dual: bool, by_rows: bool, bits: int) -> TextKernel:
     """The kernel of a `run` of `Ordinates`."""
+    declared = members_of(HEADER, "Sweep")
     kind = f"Ordinates<{'Dual<F>' if is_dual else 'F'}, F, {str(not by_rows).lower()}>"
-    text = f"F cell[{kind}::CELL]; const Sweep<F> of = {{{names_of(GIVEN)}}};"
+    text = f"F cell[{kind}::CELL]; const Sweep<F> of = {{{names_of(declared)}}};"
     text += f"{kind}(item, of, cell).run<{kind}::{run}>();"
     name = f"ordinates_{run.lower()}"
-    return TextKernel(name, bits, text, GIVEN, MADE, "transport/fused/ordinates.h")
+    return TextKernel(name, bits, text, declared, WRITTEN, HEADER)
 
 
 def sweep_ordinates(

@@ -66,16 +66,15 @@ class Uncertainty(Job):
     `deviation` is that of all pixels.
     """
 
-    title = "uncertainty"
-
     def __init__(self, run: Reconstruction, seed: int, wanted: int = 2):
-        self.run, self.parameters, self.seed = run, run.parameters, seed
+        self.parameters, self.seed = run.parameters, seed
         self.wanted, self.seconds, self.path = wanted, 0.0, Path()
         views, settings = run.level.train.views, run.problem.settings
         self.values = {p.name: p.value.detach() for p in run.parameters}
         sums = {name: float(value.double().abs().sum()) for name, value in self.values.items()}
         noise = None if settings.noise is None else vars(settings.noise)
-        self.result_of = {"iteration": run.iteration, "values": sums, "seed": seed, "noise": noise}
+        result_of = {"iteration": run.iteration, "values": sums, "seed": seed, "noise": noise}
+        super().__init__(run, "uncertainty", result_of)
         images = photograph(run.level.train, self.values)
         self.residuals = {v.name: target_of(v) - images[v.name] for v in views}
         noises = {v.name: given_noise(v, settings) for v in views}
