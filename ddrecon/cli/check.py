@@ -10,7 +10,7 @@ from typing import Any
 from ddrecon.cameras import CELL, cell_width
 from ddrecon.engine import current_engine
 from ddrecon.errors import DdreconError, SceneError
-from ddrecon.io.info import sizes_text
+from ddrecon.io.info import box_text, sizes_text
 from ddrecon.memory import gibibytes
 from ddrecon.reconstruct.loop import time_iteration
 from ddrecon.reconstruct.setup import select_views
@@ -81,16 +81,15 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
         support = describe_support(supports, grid)
         if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
-    low, high = (list(corner) for corner in grid.bounds_xyz)
-    cells, sides = list(reversed(grid.shape)), list(reversed(grid.spacing))
-    lines = [f"grid: {sizes_text(cells)} cells of {sizes_text(sides)} u, from {low} to {high}"]
+    bounds, cells = list(map(list, grid.bounds_xyz)), list(reversed(grid.shape))
+    lines = [f"grid: {sizes_text(cells)} cells of {box_text(cells, bounds)}"]
     views, texts = _describe_views(scene)
     lines += [f"views: {len(views)}", *texts]
     widths = [view["cell"] for view in views]
     report: dict[str, Any] = {
         "resolution": cells,
-        "bounds": [low, high],
-        "voxel": sides,
+        "bounds": bounds,
+        "voxel": list(reversed(grid.spacing)),
         "views": views,
         "physics": [*needed_terms(scene), *thick_terms(scene)],
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},

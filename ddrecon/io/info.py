@@ -75,9 +75,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         return ["no fields"]
     box = ", no box: the scene's volume.bounds will be taken"
     if report["bounds"] is not None:
-        low, high = report["bounds"]
-        sides = (np.subtract(high, low) / report["resolution"]).tolist()
-        box = f" of {sizes_text(sides)} u, from {low} to {high}"
+        box = f" of {box_text(report['resolution'], report['bounds'])}"
     return [
         f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
         *(
@@ -99,6 +97,13 @@ def _values(report: dict[str, Any], filled: str, about: str = "") -> str:
         f"{'gray' if report['colors'] == 1 else 'RGB'}, {about}{numbers}, "
         f"mean {report['mean']:.4g}, {filled} in {100 * report['filled']:.3g} %"
     )
+
+
+def box_text(cells: Sequence[int], bounds: Sequence[Sequence[float]]) -> str:
+    """How large `cells` (x, y, z) are in a box [2, 3], and where it is."""
+    low, high = ([float(f"{number:.7g}") for number in corner] for corner in bounds)
+    sides = np.subtract(bounds[1], bounds[0]) / cells
+    return f"{sizes_text(sides.tolist())} u, from {low} to {high}"
 
 
 def sizes_text(sizes: Sequence[float]) -> str:
