@@ -44,11 +44,11 @@ def test_the_tools_of_openvdb_list_the_grids(tmp_path: Path) -> None:
 
 def test_openvdb_knows_facts_and_what_vectors_are(tmp_path: Path) -> None:
     """Numbers, colors and texts are metadata of each grid; arrows turn with a grid, colors not."""
-    facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.25), "units": "sigma_t [1/u] µ"}
+    facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.1), "units": "sigma_t [1/u] µ"}
     vectors = dict.fromkeys(("velocity", "albedo"), sparse(9, 4, 5, 3))
     path = written(tmp_path / "smoke.vdb", facts, density=sparse(9, 4, 5), **vectors)
     told = "[[g['sigma_t'], g['g'], g['units']] for g in grids.values()]"
-    assert openvdb_python.described(told, path) == 3 * [[[1.5, 2, 4], 0.25, facts["units"]]]
+    assert openvdb_python.described(told, path) == 3 * [[[1.5, 2, 4], 0.1, facts["units"]]]
     kinds = "{n: [g.gridClass, g.metadata.get('vector_type')] for n, g in grids.items()}"
     assert openvdb_python.described(kinds, path) == {
         "density": ["fog volume", None],
