@@ -1,6 +1,6 @@
 """Fig. 8 of docs/experiments.md: our derivative images beside differences of path-traced ones.
 
-    python benchmarks/paper_gradients.py [-o FOLDER] [--paths 8192]
+    python benchmarks/paper.py fig08
 
 Every cell's density, or its absorption, changes by the same amount. Derivatives are taken in the
 middle between two scenes that Mitsuba traces: the cloud as it is, and with a little more density
@@ -9,7 +9,6 @@ everywhere; for absorption, less and more. Pictures that are there already are n
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from paper_figures import (
     CONFIGS,
     PICTURES,
-    ROOT,
     SHAPES,
     Array,
     save,
@@ -81,7 +79,7 @@ def changes(folder: Path) -> list[Change]:
     ]
 
 
-def trace_derivative(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
+def trace_derivative(change: Change, folder: Path) -> tuple[Array, float]:
     """The derivative image [h, w] from path tracing, and the standard error of its pixels (root
     mean square).
     """
@@ -90,7 +88,7 @@ def trace_derivative(change: Change, folder: Path, paths: int) -> tuple[Array, f
         output = folder / f"{change.parameter}_{name}"
         if not (output / "reference.json").exists():
             ddrecon(
-                "reference", CONFIG, "-o", output, "--views", "--spp", str(paths), "-D", override
+                "reference", CONFIG, "-o", output, "--views", "--spp", str(PATHS), "-D", override
             )
         picture = np.load(output / "front.npy").mean(-1)
         noise = json.loads((output / "reference.json").read_text())["views"]["front"]["noise"]
@@ -125,13 +123,13 @@ def relative_error(image: Array, truth: Array) -> float:
     return float(np.sqrt(((image - truth) ** 2).mean() / (truth**2).mean()))
 
 
-def remake(folder: Path, paths: int = PATHS) -> None:
+def remake(folder: Path) -> None:
     """Draws the picture and rewrites the table."""
     folder.mkdir(parents=True, exist_ok=True)
     seen, lines, count = regions(folder), [*TOP], len(MODELS)
     figure, axes = plt.subplots(2, 1 + 2 * count, figsize=(12, 4), layout="constrained")
     for row, change in zip(axes, changes(folder), strict=True):
-        truth, noise = trace_derivative(change, folder, paths)
+        truth, noise = trace_derivative(change, folder)
         full = float(np.quantile(np.abs(truth), 0.99))
         row[0].set_ylabel(f"by {change.parameter}")
         show_signed(row[0], truth, full, "differences of\npath tracing")
@@ -144,7 +142,7 @@ def remake(folder: Path, paths: int = PATHS) -> None:
             words = f"{ENLARGED} x |error|,\nours, {name}: {relative_error(image, truth):.2f}"
             away.set_title(words, fontsize=8)
     save(figure, PICTURE)
-    keep("fig08", "python benchmarks/paper_gradients.py", lines)
+    keep("fig08", "python benchmarks/paper.py fig08", lines)
 
 
 def line(
@@ -162,18 +160,3 @@ def line(
     numbers = noise / np.sqrt((truth**2).mean()), relative_error(image, truth)
     cells = [change.parameter, name, *(f"{n:.3f}" for n in numbers), words, f"{alike:.3f}"]
     return f"| {' | '.join(cells)} |"
-
-
-def main() -> None:
-    """Remakes Fig. 8."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
-    parser.add_argument("--paths", type=int, default=PATHS)
-    given = parser.parse_args()
-    remake(given.output, given.paths)
-
-
-if __name__ == "__main__":
-    main()

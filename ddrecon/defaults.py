@@ -186,10 +186,12 @@ def choose_exchanges(ground: Ground, is_periodic: bool, optimized: Collection[st
     after n exchanges over an albedo A, most where R is n/(n+1).
     """
     albedo = 1.0 if "ground.albedo" in optimized else float(ground.mean_albedo.max())
+
+    def lack(n: int) -> float:
+        return albedo ** (n + 1) * n**n / (n + 1) ** (n + 1)
+
     count = 1
-    while is_periodic and count < MOST_EXCHANGES:
-        if albedo ** (count + 1) * count**count / (count + 1) ** (count + 1) <= LEFT_OUT:
-            break
+    while is_periodic and count < MOST_EXCHANGES and lack(count) > LEFT_OUT:
         count += 1
     return count
 

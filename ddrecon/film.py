@@ -11,14 +11,14 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from shutil import rmtree
 from statistics import mean
 from tempfile import TemporaryDirectory
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.pictures import encode_bytes
 from ddrecon.progress import say
+from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import Plot, draw_curve, write_page
@@ -105,6 +106,8 @@ SHOWN = 48
 """Frames whose pictures and volumes are on the page; all are in their folders."""
 WIDEST = 768
 """Pixels across target, render and difference, at most."""
+PAUSE = 0.2
+"""Seconds after which a rank looks again whether the film is calibrated."""
 REPORT_SHARE = 0.05
 """While frames are made, their page takes no more than this part of the time."""
 
@@ -194,7 +197,8 @@ class Film:
             sums.append(torch.stack(values).sum(0))
         motion = find_flow(*sums) / (number - before) * self._cell
         for frame in (number, before):
-            with claim_folder(self.of(frame), RUN, resume=True):
+            # Where another rank is writing, it writes this as well.
+            with suppress(UsageError), claim_folder(self.of(frame), RUN, resume=True):
                 if not volume_file(self.of(frame), VELOCITY).is_file():
                     write_volume(self.of(frame), VELOCITY, motion.flip(0), self.grid)
 
@@ -321,16 +325,22 @@ def open_film(
     return chosen
 
 
-def drive_frames(film: Film, folder: Folder, numbers: Sequence[int]) -> Iterator[int]:
+def drive_frames(film: Film, folder: Folder | None, numbers: Sequence[int]) -> Iterator[int]:
     """Yields the frames `numbers` of `film` as they are finished, after its calibration.
 
-    A frame that fails is named and left out; its error is raised when all others are done.
+    A rank whose `folder` is None waits for the calibration of another. A frame that fails is named
+    and left out; its error is raised when all others are done.
     """
     shared, failures = film.path / SHARED, list[DdreconError]()
-    if film.frames.calibrate and not shared.is_file():
+    while film.frames.calibrate and not shared.is_file():
+        if folder is None:
+            sleep(PAUSE)
+            continue
         job = Calibration(film, spread_out(film.frames.numbers, film.frames.calibrate))
         if job.run.shared:
             work(job, folder, has_checkpoint(film.path / CHECKPOINTS))
+        else:
+            write_json(shared, {"frames": [], "values": {}, "texts": {}})
     film.shared = read_shared(shared) if shared.is_file() else {}
     for number in numbers:
         try:
@@ -375,6 +385,12 @@ def export_film(film: Film, kind: str, up: str | None) -> None:
         path = film.path / SEQUENCE / f"film_{number:04d}.{kind}"
         turned = turn_up(fields, bounds, upright, up or upright)
         write_fields(path, *turned, {**facts, **constants})
+
+
+def share_out(numbers: Sequence[int]) -> Sequence[int]:
+    """This rank's share of the frames `numbers`, one after another; the first rank has some."""
+    begin, end = (-(-len(numbers) * (own_rank() + more) // rank_count()) for more in (0, 1))
+    return numbers[begin:end]
 
 
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
@@ -460,7 +476,7 @@ def fix_shared(described: dict[str, Any], values: Mapping[str, Any], source: Pat
 
 
 def drive_film(
-    film: Film, folder: Folder, numbers: Sequence[int], exported: str | None, up: str | None
+    film: Film, folder: Folder | None, numbers: Sequence[int], exported: str | None, up: str | None
 ) -> Outcome:
     """Tells of `film` after its frames `numbers`, of which those that are done stay.
 

@@ -260,20 +260,20 @@ def _optimize_film(
     exported: str | None,
     up: str | None,
 ) -> Outcome:
-    """Reconstructs the `frames` of a film."""
-    from ddrecon.film import Film, drive_film, open_film
+    """Reconstructs this rank's share of the `frames` of a film."""
+    from ddrecon.film import Film, drive_film, open_film, share_out
     from ddrecon.io.files.folders import FILM
-    from ddrecon.ranks import rank_count
+    from ddrecon.ranks import alone, from_first
 
     environment = session.environment()
-    if rank_count() > 1:
-        advice = "give each process an -o of its own, --frames and --shared"
-        raise UsageError(f"torchrun: one process makes a film; {advice}")
     film = Film(scene_file, session.output, session.build, environment, preview_every)
     with session.claim(FILM) as folder:
-        assert folder is not None
-        numbers = open_film(film, folder, frames, shared, is_resumed=session.resume)
-        return drive_film(film, folder, numbers, exported, up)
+        numbers = list[int]()
+        if folder is not None:
+            numbers = open_film(film, folder, frames, shared, is_resumed=session.resume)
+        share = share_out(from_first(numbers))
+        with alone():
+            return drive_film(film, folder, share, exported, up)
 
 
 @command("RUN", "output overwrite experiments resume report", is_shared=True)

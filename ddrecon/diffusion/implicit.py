@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import Solution
-from ddrecon.numerics.autodiff import keep, run_plainly
+from ddrecon.numerics.autodiff import fill_changes, keep, run_plainly
 from ddrecon.numerics.remember import may_read
 
 
@@ -150,10 +150,8 @@ class ImplicitSolve(torch.autograd.Function):
     ) -> Tensor:
         u, *tensors = ctx.saved_tensors
         operator = ctx.assemble(ctx.prepared, *tensors).linearized(u)
-        pairs = zip(tensors, d_tensors, strict=True)
-        changes = [torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs]
         # E3.1: A du = dS - dA u.
-        right = -operator.change(changes, u)
+        right = -operator.change(fill_changes(d_tensors, tensors), u)
         right = right if d_source is None else right + d_source
 
         def solve(right: Tensor, u: Tensor, *tensors: Tensor) -> Tensor:

@@ -276,10 +276,8 @@ def limit_diffusion(u: Tensor, extinction: Tensor, grid: Grid) -> Tensor:
     light = u**2 + dark**2 + torch.finfo(u.dtype).tiny
     for axis, step in zip(AXES, grid.spacing, strict=True):
         if u.shape[axis] > 1:
-            slopes = u.diff(dim=axis) / step
-            ends = slopes.narrow(axis, 0, 1), slopes.narrow(axis, slopes.shape[axis] - 1, 1)
-            slopes = face_average(torch.cat([ends[0], slopes, ends[1]], axis), axis)
-            square = square + 4 * slopes**2 / light
+            (slope,) = torch.gradient(u, spacing=step, dim=axis)
+            square = square + 4 * slope**2 / light
     return 1 / square.sqrt()
 
 

@@ -20,7 +20,13 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly, with_signature
+from ddrecon.numerics.autodiff import (
+    differentiate_once,
+    fill_changes,
+    keep,
+    run_plainly,
+    with_signature,
+)
 
 Tensors = tuple[Tensor, ...]
 
@@ -84,7 +90,7 @@ class RowFunction:
             "colors": colors,
             "numbers": numbers,
             "fields": fields,
-            "channels": [len(field) for field in fields],
+            "channels": [field.shape[0] for field in fields],
             **self.more,
             **more,
         }
@@ -138,10 +144,7 @@ class _Applied(torch.autograd.Function):
             d_values = tensors[saved:]
             # The change stands for what something is added to, as well.
             values = *tensors[:saved], *d_values[saved:]
-            d_numbers, *d_fields = (
-                torch.zeros_like(value) if d_value is None else d_value.expand_as(value)
-                for value, d_value in zip(values, d_values, strict=True)
-            )
+            d_numbers, *d_fields = fill_changes(d_values, values)
             more = {"d_numbers": d_numbers, "d_fields": _one_by_one(d_fields)}
             return ctx.function.run("tangents", values[0], values[1:], **more)[0]
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot, pad
+from torch.nn.functional import pad
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
@@ -356,7 +356,8 @@ def _beyond(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
             face[0], face[-1] = 2 * along, 2 * along + 1
         faces.append(face)
     by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)
-    return one_hot(by_axis[:, _find_places(grid)[0]], len(FACES) + 1).to(device, dtype)
+    kinds = by_axis[:, _find_places(grid)[0], None] == torch.arange(len(FACES) + 1)
+    return kinds.to(device, dtype)
 
 
 def _find_places(grid: Grid) -> tuple[Tensor, Tensor]:

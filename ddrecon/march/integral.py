@@ -225,7 +225,9 @@ def march_periods(
             )
         depth = (scale * mass[:, number]).detach().amin(0)
         left = ((far > end) & (depth < OPAQUE)).nonzero()[:, 0]
-        onward = torch.nn.functional.one_hot(axis, 3) * direction.detach().sign()
+        onward = (
+            axis[..., None] == torch.arange(3, device=axis.device)
+        ) * direction.detach().sign()
         copy, number = (copy + onward)[left], number[left]
         rays, near, far = rays.select(left), end[left], far[left]
     return radiance, mass

@@ -225,26 +225,22 @@ def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> V
     return replace(volume, grid=grid, phase=volume.phase.move_cells(put), media=None, **fields)
 
 
-def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
-    """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
-
-    f is what of the phase function lies beyond `degree`. Source: Joseph, Wiscombe, Weinman 1976,
-    doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
-    """
-    return _medium(volume, degree, peak_fraction(volume.phase, degree, 1))
-
-
 def keep_medium(volume: Volume) -> Medium:
     """The medium of `volume` as it is, with f = 0.
 
     Path tracing separates single from multiple scattering by it.
     """
-    return _medium(volume, P1_DEGREE, None)
+    return scale_medium(volume, P1_DEGREE, volume.density.new_zeros(()))
 
 
-def _medium(volume: Volume, degree: int, fraction: Tensor | None) -> Medium:
+def scale_medium(volume: Volume, degree: int = P1_DEGREE, fraction: Tensor | None = None) -> Medium:
+    """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
+
+    f is the `fraction`, by default what of the phase function lies beyond `degree`. Source: Joseph,
+    Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
+    """
     g = _mean_cosine(volume.phase)
-    fraction = g.new_zeros(()) if fraction is None else fraction
+    fraction = peak_fraction(volume.phase, degree, 1) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
     by_cell = sigma_s[0].numel() > 1 and not is_varied(sigma_s)
     if by_cell and not is_any_nonzero(volume.sigma_s):

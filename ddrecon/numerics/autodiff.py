@@ -99,6 +99,12 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
         ctx.save_for_forward(*tensors)
 
 
+def fill_changes(changes: Iterable[Tensor | None], values: Iterable[Tensor]) -> list[Tensor]:
+    """`changes` of `values`, zero where there are none."""
+    pairs = zip(changes, values, strict=True)
+    return [torch.zeros_like(value) if d is None else d.expand_as(value) for d, value in pairs]
+
+
 def run_plainly(function: Callable[..., Any], *tensors: Tensor | None) -> Any:
     """`function(*tensors)`, a tensor or several, which have no derivatives.
 

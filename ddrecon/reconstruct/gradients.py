@@ -26,6 +26,7 @@ from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
+from ddrecon.numerics.autodiff import fill_changes
 from ddrecon.numerics.remember import without_reads
 from ddrecon.picture import view_picture
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers, sum_over_ranks
@@ -97,10 +98,7 @@ def differentiate(
     through_light = follow_back(tensors, leaf_bars, list(values.values()))
     # The derivative is the sum of both ways.
     totals = map(_add, direct, through_light)
-    gradients = {
-        name: torch.zeros_like(value) if bar is None else bar
-        for (name, value), bar in zip(values.items(), totals, strict=True)
-    }
+    gradients = dict(zip(values, fill_changes(totals, values.values()), strict=True))
     return Differentiated(images, loss if total is None else total, agree_on(gradients))
 
 

@@ -53,14 +53,26 @@ class Problem:
     def of(scene: Scene, iterations: Iterations | None = None) -> Problem:
         """What `scene` asks for, in as many `iterations` as it says, or as given.
 
-        Raises SceneError and FormatError where that cannot be had.
+        Raises SceneError and FormatError where that cannot be had, UsageError for `iterations`
+        that are none.
         """
-        settings = require_settings(scene, iterations)
+        if isinstance(iterations, str) and iterations != AUTO:
+            raise UsageError(f"iterations: expected a number or {AUTO!r}, found {iterations!r}")
+        if (settings := scene.optimize) is None:
+            raise SceneError(
+                "optimize: missing section; say what to reconstruct, such as"
+                " parameters: {density: {}}"
+            )
+        if iterations is not None:
+            settings = replace(settings, iterations=iterations)
         train, test = (select_views(scene, is_test) for is_test in (False, True))
         require_usable(train, settings)
         loss = choose_loss(settings, train)
-        views = replace(scene, views=[*train.views, *test.views])
-        noises = known_noises(views, settings, loss)
+        noises = {
+            view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
+            for view in (*train.views, *test.views)
+            if loss == "photon"
+        }
         powers = [target.power for target in targets_of(train, loss, noises).values()]
         power = float(torch.stack(powers).mean())
         support = find_support(train, settings)
@@ -91,20 +103,6 @@ class Level:
     test: Scene
     targets: Mapping[str, Target]
     test_targets: Mapping[str, Target]
-
-
-def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
-    """What `scene` asks for, with `iterations` in place of its own where given.
-
-    Raises SceneError where it asks for nothing, UsageError for `iterations` that are none.
-    """
-    if isinstance(iterations, str) and iterations != AUTO:
-        raise UsageError(f"iterations: expected a number or {AUTO!r}, found {iterations!r}")
-    if scene.optimize is None:
-        raise SceneError(
-            "optimize: missing section; say what to reconstruct, such as parameters: {density: {}}"
-        )
-    return scene.optimize if iterations is None else replace(scene.optimize, iterations=iterations)
 
 
 def select_views(scene: Scene, is_test: bool) -> Scene:
@@ -180,19 +178,6 @@ def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
     """The noise of the picture of `view`, as its scene says."""
     noise = settings.noise
     return Noise(noise.read, noise.shot, view.step) if noise else None
-
-
-def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
-    """The noise of the picture of each view of `scene`, by name, if `loss` compares by it.
-
-    It is estimated from pictures where it is not given.
-    """
-    if loss != "photon":
-        return {}
-    return {
-        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
-        for view in scene.views
-    }
 
 
 def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:

@@ -53,7 +53,7 @@ TRUST = 0.5
 """Pixels by which a volume may be off that was made with such cameras: pictures count against the
 calibration as if each image were known no better."""
 
-# How long a run is, and how exact (`schedule`, `levels`).
+# How long a run is, and how exact (`schedule`, `setup`).
 MOST_ITERATIONS = 300
 """A run that ends by itself makes at most so many."""
 FEWEST_CELLS, FEWEST_PIXELS = 16, 16

@@ -1,10 +1,14 @@
 """A film from the command line: each frame is a run, and nothing depends on when it was done."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import chdir
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +24,7 @@ import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.errors import UsageError
-from ddrecon.film import MIXED, spread_out
+from ddrecon.film import MIXED, share_out, spread_out
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -230,6 +234,32 @@ def test_killed_anywhere_and_in_parts_to_the_same_bits(
     films = [json.loads(Path(place, "film.json").read_text()) for place in ("parts", whole)]
     psnrs = [[row["psnr"] for row in record["frames"]] for record in films]
     assert psnrs[0] == psnrs[1]
+
+
+@pytest.mark.slow
+def test_ranks_share_out_the_frames_and_calibrate_once(film: Path) -> None:
+    """The second waits, and takes what the first has found; the last to end knows of all."""
+    job = {"ranks": 2, "arguments": optimize("-o", "out", *FEW)}
+    script = Path(__file__).parents[1] / "ranks/forked.py"
+    known = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    run = [sys.executable, str(script), json.dumps([job]), "."]
+    subprocess.run(run, check=True, timeout=200, env=known)
+    assert json.loads(Path("codes.json").read_text()) == [[0, 0]]
+    frames = json.loads(Path("out/film.json").read_text())["frames"]
+    assert [row["frame"] for row in frames] == [*range(FRAMES)]
+    found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 2)]
+    assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
+
+
+def test_ranks_share_out_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    for frames, count in product(range(1, 6), range(1, 8)):
+        monkeypatch.setattr("ddrecon.film.rank_count", lambda count=count: count)
+        shares = []
+        for rank in range(count):
+            monkeypatch.setattr("ddrecon.film.own_rank", lambda rank=rank: rank)
+            shares.append(share_out(range(frames)))
+        assert [*chain(*shares)] == [*range(frames)] and shares[0]
+        assert max(map(len, shares)) == -(-frames // count)
 
 
 def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:

@@ -112,6 +112,27 @@ def test_light_through_a_face_begins_smoothly():
             assert float(shine_through(GRID, place, is_point)[0]) <= 1e-8
 
 
+def test_light_lacks_as_much_on_faces_however_far_fields_are_extended():
+    """Half a cell beyond faces, or up to them (E2.17); amid each face."""
+    outgoing, depth = emission_of(random_values(1, *GRID.shape)), torch.full((1, 1, 1, 1), 4.0)
+    matter = replace(outgoing.extinction, scale=depth.double())
+    backward = random_values(1, cells_at_faces(GRID, outgoing.diffuse).shape[-1], seed=5)
+    outgoing = replace(outgoing, extinction=matter, scattering=matter)
+    coming = replace(outgoing, inflow=Inflow(0.2 * depth, 0 * backward, 0.9 * depth, backward))
+    changes = [
+        torch.sub(*(extend_fields(light, axis)["diffuse"] for light in (coming, outgoing)))
+        for axis in (None, 0, 1, 2)
+    ]
+    for axis, side in product(range(3), range(2)):
+        layers, last = (
+            [change.select(1 + axis, -1 - k if side else k)[:, 2:-2, 2:-2] for change in changes]
+            for k in range(2)
+        )
+        on_face = layers[1 + axis]
+        assert bool(on_face.all())
+        torch.testing.assert_close(0.5 * (layers[0] + last[0]), on_face, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
 def test_extended_fields_have_both_derivatives(axis: int | None, engine: str):

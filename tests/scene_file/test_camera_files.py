@@ -210,56 +210,51 @@ def test_names_are_legal_and_differ(views: Any, files: list[Any], names: list[st
     assert [view.name for view in views(*map(frame, files), **NERFSTUDIO)] == names
 
 
-SCALED = [[2 * x for x in row] for row in POSE[:3]] + POSE[3:]
-FISHEYE = {"camera_model": "OPENCV_FISHEYE", "p1": 1e-3}
-WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
-    ([frame()], {"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
-    ([frame()], FISHEYE, "p1: p1 = 0.001 is not modeled"),
-    ([frame()], {"camera_model": "EQUIRECTANGULAR"}, "camera_model: EQUIRECTANGULAR is a lens"),
-    ([frame()], {"ftheta_p0": 0.0, "ftheta_p1": 0.01}, "ftheta_p1: is of a lens that is not"),
-    ([frame(latlong=True)], {}, "frames.0.latlong: is of a lens that is not modeled; undistort"),
-    ([frame(K=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])], {}, "frames.0.K: is not read: write fl_x, fl_y"),
-    ([frame(dist_coeffs=[[0.1, 0]])], {}, "frames.0.dist_coeffs: is not read: write k1, k2"),
-    ([frame()], {"is_fisheye": "false"}, "is_fisheye: expected true or false"),
-    ([frame()], {"x_fov": 180}, "x_fov: must be below 180"),
-    ([frame()], {"fl_x": 0}, "fl_x: must be above 0"),
-    ([frame()], {"w": 8.5}, "w: expected a whole number, found 8.5"),
-    ([frame()], {"w": 10**400}, "w: expected a finite number"),
-    ([frame()], {"cx": float("nan")}, "cx: expected a finite number"),
-    ([], {}, "frames: expected a list with at least one frame"),
-    (
-        [frame(transform_matrix=POSE[:3])],
-        {},
-        "frames.0.transform_matrix: expected a list of 4 rows",
-    ),
-    ([frame(transform_matrix=SCALED)], {}, "frames.0.transform_matrix: must be rigid"),
-    ([{"file_path": "a.png"}], {}, "frames.0: missing key 'transform_matrix'"),
-    ([frame(), 3], {}, "frames.1: expected a mapping, found 3"),
-    ([frame(7)], {}, "frames.0.file_path: expected a file, found 7"),
-    ([frame("a")], {"val_filenames": [3]}, "val_filenames.0: expected a file, found 3"),
-]
-TOO_LITTLE: list[tuple[list[Any], dict[str, Any], str]] = [
-    ([frame()], {"w": 8, "h": 6}, "frames.0: has neither fl_x nor camera_angle_x"),
-    ([frame()], {"fl_x": 20}, "fl_x: is in pixels, but w and h do not say how many there are"),
-    (
-        [frame()],
-        {"camera_angle_y": 0.5},
-        "frames.0: says how high its picture is, but not how wide",
-    ),
-    ([frame(None)], {"camera_angle_x": 0.5}, "frames.0: has neither file_path nor w and h"),
-]
+WRONG = """
+{"k5": 0.01} => k5: k5 = 0.01 is not modeled; undistort
+{"camera_model": "OPENCV_FISHEYE", "p1": 1e-3} => p1: p1 = 0.001 is not modeled
+{"camera_model": "EQUIRECTANGULAR"} => camera_model: EQUIRECTANGULAR is a lens
+{"ftheta_p0": 0.0, "ftheta_p1": 0.01} => ftheta_p1: is of a lens that is not
+{"frame": {"latlong": true}} => frames.0.latlong: is of a lens that is not modeled; undistort
+{"frame": {"K": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}} => frames.0.K: is not read: write fl_x, fl_y
+{"frame": {"dist_coeffs": [[0.1, 0]]}} => frames.0.dist_coeffs: is not read: write k1, k2
+{"is_fisheye": "false"} => is_fisheye: expected true or false
+{"x_fov": 180} => x_fov: must be below 180
+{"fl_x": 0} => fl_x: must be above 0
+{"w": 8.5} => w: expected a whole number, found 8.5
+{"w": HUGE} => w: expected a finite number
+{"cx": NaN} => cx: expected a finite number
+{"frames": []} => frames: expected a list with at least one frame
+{"frame": {"transform_matrix": [[1, 0, 0, 0]]}} => frames.0.transform_matrix: expected a list of 4 r
+{"frame": {"transform_matrix": SCALED}} => frames.0.transform_matrix: must be rigid
+{"frames": [{"file_path": "a.png"}]} => frames.0: missing key 'transform_matrix'
+{"frames": [3]} => frames.0: expected a mapping, found 3
+{"frame": {"name": 7}} => frames.0.file_path: expected a file, found 7
+{"val_filenames": [3]} => val_filenames.0: expected a file, found 3
+{"only": {"w": 8, "h": 6}} => frames.0: has neither fl_x nor camera_angle_x
+{"only": {"fl_x": 20}} => fl_x: is in pixels, but w and h do not say how many there are
+{"only": {"camera_angle_y": 0.5}} => frames.0: says how high its picture is, but not how wide
+{"only": {"camera_angle_x": 0.5}, "frame": {"name": null}} => frames.0: has neither file_path nor w
+"""
+"""What a file says besides `NERFSTUDIO`, or `only` that, what its `frame`; and its one line."""
+NUMBERS = {
+    "HUGE": f"1{'0' * 400}",
+    "SCALED": str([[2 * x for x in row] for row in POSE[:3]] + POSE[3:]),
+}
 
 
-@pytest.mark.parametrize(
-    ("frames", "shared", "problem"),
-    [*((frames, NERFSTUDIO | change, problem) for frames, change, problem in WRONG), *TOO_LITTLE],
-)
+@pytest.mark.parametrize("row", WRONG.strip().split("\n"))
 def test_what_is_no_camera_of_ours_is_refused_by_key(
-    refusal: Any, tmp_path: Path, frames: list[Any], shared: dict[str, Any], problem: str
+    refusal: Any, tmp_path: Path, row: str
 ) -> None:
-    text = transforms(tmp_path / "transforms.json", *frames, **shared)
-    (line,) = refusal(text, kind=FormatError)
-    assert line.startswith(f"transforms.json: {problem}")
+    text, _, problem = row.partition(" => ")
+    for word, number in NUMBERS.items():
+        text = text.replace(word, number)
+    said = json.loads(text)
+    frames = said.pop("frames", [frame(**said.pop("frame", {}))])
+    shared = said.pop("only", NERFSTUDIO) | said
+    (line,) = refusal(transforms(tmp_path / "t.json", *frames, **shared), kind=FormatError)
+    assert line.startswith(f"t.json: {problem}")
 
 
 def test_a_film_begins_at_its_time(read: Read, views: Any, tmp_path: Path) -> None:

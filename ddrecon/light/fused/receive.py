@@ -11,7 +11,7 @@ from torch import Tensor
 from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.beam import MOST_BEAMS
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.autodiff import differentiate_once, fill_changes, keep, run_plainly
 
 CHUNK = 256
 """Cells that one item does on a processor; on a GPU it is one."""
@@ -72,10 +72,7 @@ class _Received(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            d_field, d_entered, d_numbers = (
-                torch.zeros_like(value) if d_value is None else d_value
-                for value, d_value in zip(tensors[:3], tensors[3:], strict=True)
-            )
+            d_field, d_entered, d_numbers = fill_changes(tensors[3:], tensors[:3])
             d_values = {"d_field": d_field, "d_entered": d_entered, "d_numbers": d_numbers}
             return _receive("tangent", *tensors[:3], **d_values)
 

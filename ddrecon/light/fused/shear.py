@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 from ddrecon.light.shear import Shear
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.autodiff import differentiate_once, fill_changes, keep, run_plainly
 from ddrecon.numerics.layout import Slicing
 
 GHOSTS = 3
@@ -105,10 +105,7 @@ class _Masses(torch.autograd.Function):
     def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
         def change(*tensors: Any) -> Tensor:
             (numbers, *fields), changes = tensors[:count], tensors[-count:]
-            d_numbers, *d_fields = (
-                torch.zeros_like(value) if d_value is None else d_value
-                for value, d_value in zip(tensors, changes, strict=False)
-            )
+            d_numbers, *d_fields = fill_changes(changes, tensors[:count])
             slicings = _slicings(ctx.shears)
             laid = {k: pair for k, *pair in zip(slicings, fields, d_fields, strict=True)}
             tangents = []
