@@ -101,7 +101,7 @@ def _values(report: dict[str, Any], filled: str, about: str = "") -> str:
 
 def box_text(cells: Sequence[int], bounds: Sequence[Sequence[float]]) -> str:
     """How large `cells` (x, y, z) are in a box [2, 3], and where it is."""
-    low, high = ([float(f"{number:.7g}") for number in corner] for corner in bounds)
+    low, high = ([float(f"{number:.9g}") for number in corner] for corner in bounds)
     sides = np.subtract(bounds[1], bounds[0]) / cells
     return f"{sizes_text(sides.tolist())} u, from {low} to {high}"
 
