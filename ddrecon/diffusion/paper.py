@@ -3,8 +3,8 @@
 `solve_printed` has the paper's central differences (Eq. 22-25) and Algorithm 3, with kappa = 3 D
 and the corrections of docs/corrections.md. Energy is not kept, the matrix is not symmetric, and the
 iteration may diverge where kappa changes abruptly: at every surface against empty space. Of the
-stencils of Appendix B, Sigma5 is the sum of all that is `beside` a cell, and Sigma4 and Sigma7 are
-made of `slopes`. torch takes the derivatives: Sigma1, 2, 6, 8 and 9.
+stencils of Appendix B, Sigma5 / h^2 is the first of `make_stencils`, and Sigma4 and Sigma7 are made
+of its three gradients. torch takes the derivatives: Sigma1, 2, 6, 8 and 9.
 
 `solve_flux_limited` has a D that depends on the light that it diffuses (Koerner et al. 2014,
 arXiv:1403.8105): N(u) = kappa_s Q0 holds E2.4 to E2.6 with D = D(u). Damped Picard iteration solves
@@ -22,7 +22,7 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import conv3d, pad
 
 from ddrecon.diffusion.implicit import ImplicitSolve, SolverWithMemory
 from ddrecon.diffusion.operator import (
@@ -122,25 +122,36 @@ def solve_printed(
     """
     grid, kappa, (mean_source, first) = medium.grid, 3 * diffusion, mean_and_first(scattered)
     flux = None if first is None else flux_along_axes(first)
+    stencils = make_stencils(grid, kappa)
     echo, inflow = fill_ghosts(grid, kappa, flux, outside)
-    weights = weigh_neighbors(grid, kappa)
-    diagonal = 3 * medium.absorption.value + weights.sum(1)
+    diagonal = 3 * medium.absorption.value + kappa * sum(2 / h**2 for h in grid.spacing)
+    weights = torch.cat([kappa[:, None], convolve(extend(kappa), stencils[1:])], 1)
     # S; and what ghost cells hold by themselves is known, so it stands on the right side as well
-    source = 3 * mean_source + (weights * beside(inflow)).sum(1)
-    for axis, component in enumerate(flux or ()):
+    source = 3 * mean_source + (weights * convolve(inflow, stencils)).sum(1)
+    if flux is not None:
         # Eq. 44; ghost cells repeat their neighbors: nothing varies across the faces of the box
-        source = source - slopes(grid, extend(kappa * component))[axis]
+        moved = torch.stack([extend(kappa * component) for component in flux], 1)
+        source = source - conv3d(moved, stencils[1:].transpose(0, 1))[:, 0]
 
     def assemble(_: object, *tensors: Tensor) -> PrintedOperator:
-        return PrintedOperator(tensors=tensors)
+        return PrintedOperator(grid, stencils, tensors=tensors)
 
     mean = ImplicitSolve.apply(solve, assemble, {}, source, diagonal, weights, echo)
     if not has_flux:
         return mean[None]
-    driving = [-slope for slope in slopes(grid, echo * extend(mean) + inflow)]
-    if flux is not None:
-        driving = [torch.add(*pair) for pair in zip(driving, flux, strict=True)]
-    return torch.cat([mean[None], moments_of_flux([kappa * drive for drive in driving])])
+    driving = -convolve(echo * extend(mean) + inflow, stencils[1:])
+    driving = driving if flux is None else driving + torch.stack(flux, 1)
+    return torch.cat([mean[None], moments_of_flux((kappa[:, None] * driving).unbind(1))])
+
+
+def make_stencils(grid: Grid, like: Tensor) -> Tensor:
+    """Kernels `[4, 1, 3, 3, 3]`: the sum of neighbors, each over its h^2; d/dz, d/dy and d/dx."""
+    stencils = like.new_zeros(4, 1, 3, 3, 3)
+    for axis, h in enumerate(grid.spacing):
+        line = stencils.movedim(axis + 2, -1)[:, 0, 1, 1]
+        line[0, ::2] += 1 / h**2
+        line[axis + 1] = like.new_tensor([-1, 0, 1]) / (2 * h)
+    return stencils
 
 
 def extend(u: Tensor) -> Tensor:
@@ -148,28 +159,9 @@ def extend(u: Tensor) -> Tensor:
     return pad(u, (1,) * 6, mode="replicate")
 
 
-def beside(extended: Tensor) -> Tensor:
-    """What stands below and above each cell along z, y and x, `[C, 6, z, y, x]`.
-
-    Of `extended` [C, z + 2, y + 2, x + 2].
-    """
-    cells = slice(None), *[slice(1, -1)] * 3
-    return torch.stack([extended.roll(way, axis)[cells] for axis in AXES for way in (1, -1)], 1)
-
-
-def slopes(grid: Grid, extended: Tensor) -> list[Tensor]:
-    """d/dz, d/dy and d/dx [C, z, y, x] of `extended`, by central differences."""
-    pairs = zip(beside(extended).unflatten(1, (3, 2)).unbind(1), grid.spacing, strict=True)
-    return [(pair[:, 1] - pair[:, 0]) / (2 * h) for pair, h in pairs]
-
-
-def weigh_neighbors(grid: Grid, kappa: Tensor) -> Tensor:
-    """How much of each cell's neighbors, as of `beside`, counts in Eq. 25: kappa / h^2 less or more
-    its slope over 2 h.
-    """
-    pairs = zip(slopes(grid, extend(kappa)), grid.spacing, strict=True)
-    weights = [kappa / h**2 + sign * slope / (2 * h) for slope, h in pairs for sign in (-1, 1)]
-    return torch.stack(weights, 1)
+def convolve(extended: Tensor, stencils: Tensor) -> Tensor:
+    """Each of n `stencils` on `extended` [C, z + 2, y + 2, x + 2]: `[C, n, z, y, x]`."""
+    return conv3d(extended[:, None], stencils)
 
 
 def fill_ghosts(
@@ -198,15 +190,18 @@ def fill_ghosts(
 class PrintedOperator(AutodiffOperator):
     """M u = diagonal u - kappa Sigma5(u) / h^2 - Sigma4(u) / (4 h^2), the matrix of Eq. 25.
 
-    `tensors`: the diagonal 3 kappa_a + kappa sum 2 / h^2 [1/u], `[C, z, y, x]`; weights of
-    neighbors, `[C, 6, z, y, x]`; and what a ghost cell holds per unit of its neighbor in the box, 1
-    inside, `[C, z + 2, y + 2, x + 2]`.
+    `tensors`: the diagonal 3 kappa_a + kappa sum 2 / h^2 [1/u], `[C, z, y, x]`; weights, kappa and
+    its gradient, `[C, 4, z, y, x]`; and what a ghost cell holds per unit of its neighbor in the
+    box, 1 inside, `[C, z + 2, y + 2, x + 2]`.
     """
+
+    grid: Grid
+    stencils: Tensor
 
     def product(self, u: Tensor, *tensors: Tensor) -> Tensor:
         """M u."""
         diagonal, weights, echo = tensors
-        return diagonal * u - (weights * beside(echo * extend(u))).sum(1)
+        return diagonal * u - (weights * convolve(echo * extend(u), self.stencils)).sum(1)
 
     def apply(self, u: Tensor) -> Tensor:
         """M u, which is its own derivative, or M^T u."""
@@ -252,9 +247,9 @@ def _divergence_error(operator: PrintedOperator, iteration: int, relative: float
     if iteration == 1 and relative != relative:
         message = "the system of the printed scheme is not finite"
         return SolveError(message, 0, relative, "look for NaN or infinity in the scene")
-    # 2 h times kappa's slope over kappa, as their weights say
-    below, above = operator.tensors[1].unflatten(1, (3, 2)).unbind(2)
-    ratio = (4 * (above - below) / (above + below)).abs().amax((0, 1))
+    kappa, *gradient = operator.tensors[1].unbind(1)
+    slopes = zip(gradient, operator.grid.spacing, strict=True)
+    ratio = torch.stack([2 * h * slope.abs() / kappa for slope, h in slopes]).amax((0, 1))
     z, y, x = (int(index) for index in torch.unravel_index(ratio.argmax(), ratio.shape))
     message = (
         "Jacobi on the printed scheme diverged, as it may where kappa changes from neighbor to "

@@ -360,13 +360,16 @@ def fit_volume(scene_file: SceneFile) -> SceneFile:
     if isinstance(resolution, str):
         views = build_views(Maker(each_frame(scene_file)[0]), None)
         cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
+        count = math.prod(math.ceil(side / cell) for side in sides.tolist())
+        if count > MANY_CELLS:
+            wider = (count / MANY_CELLS) ** (1 / 3)
+            fault = (
+                f"{count:,} cells two pixels wide take hours: they are {wider:.2g} times as wide"
+            )
+            warnings.warn(f"volume.resolution: {fault}", DataWarning, 2)
+            cell *= wider
         x, y, z = (max(1, math.ceil(side / cell)) for side in sides.tolist())
         resolution = x, y, z
-        if x * y * z > MANY_CELLS:
-            times = math.ceil((x * y * z / MANY_CELLS) ** (1 / 3))
-            fewer = f"pictures {times} times smaller along each side make {times**3} times fewer"
-            fault = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
-            warnings.warn(f"volume.resolution: {fault}", DataWarning, 2)
         sides = cell * sides.new_tensor(resolution)
     if isinstance(bounds, Bounds):
         # Other programs take cubes: the box grows upwards, to the right and backward for them.

@@ -211,7 +211,8 @@ class BoxSection:
     bounds: The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's file
         where left out. `auto`: what fits the pictures.
     resolution: Cells along x, y and z; left out: those of the file; `auto`: cubes two pixels
-        wide, for which the box may grow, but not along its period.
+        wide, or as wide as four million of them are, for which the box may grow, but not along its
+        period.
     up: The axis along which `heights`, a `ground` and rings count, and which `export --up` turns.
     periodic: The axes, one or two, along which the volume repeats without end, as `[x, z]`
         ([E2.15](theory.md#2-the-forward-model)). Lights are directional, ambient or maps; the

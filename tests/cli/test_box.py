@@ -167,7 +167,7 @@ def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
 def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
     scene: Callable[..., Path], run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With how many pixels a run averages."""
+    """With how many pixels a run averages; `auto` takes wider ones."""
     scene()
     told = run("check", "auto.yaml", "-D", "volume.resolution=[3, 3, 3]").stdout
     (width,) = re.findall("cells: (.*) to", told)
@@ -177,5 +177,7 @@ def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
     x, y, z = read_scene("auto.yaml").tree.volume.resolution
     monkeypatch.setattr("ddrecon.scene_file.build_views.MANY_CELLS", x * y * z // 8 + 1)
     told = run("check", "auto.yaml").stderr
-    assert f"{x} x {y} x {z} cells two pixels wide take hours: pictures 2 times smaller" in told
+    assert f"{x * y * z:,} cells two pixels wide take hours: they are 2 times as wide" in told
     assert told.count("take hours") == 1
+    wider = read_scene("auto.yaml").tree.volume.resolution
+    assert np.abs(2 * np.array(wider) - [x, y, z]).max() <= 2

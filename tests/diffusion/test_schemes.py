@@ -24,12 +24,13 @@ from ddrecon.diffusion.paper import (
     VACUUM,
     LimitedOperator,
     PrintedOperator,
+    convolve,
     extend,
     fill_ghosts,
     iterate_jacobi,
     iterate_picard,
     limit_diffusion,
-    weigh_neighbors,
+    make_stencils,
 )
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
@@ -47,19 +48,20 @@ SHAPES = [(3, 2, 4), (1, 2, 3), (1, 1, 1)]
 def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
     """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
     kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
+    stencils, squares = make_stencils(grid, kappa), sum(2 / h**2 for h in grid.spacing)
+    diagonal = 3 * random_values(colors, *grid.shape, seed=2) + kappa * squares
     echo, _ = fill_ghosts(grid, kappa, None, DARK)
-    weights = weigh_neighbors(grid, kappa)
-    diagonal = 3 * random_values(colors, *grid.shape, seed=2) + weights.sum(1)
-    return PrintedOperator(tensors=(diagonal, weights, echo))
+    weights = torch.cat([kappa[:, None], convolve(extend(kappa), stencils[1:])], 1)
+    return PrintedOperator(grid, stencils, tensors=(diagonal, weights, echo))
 
 
 def transposed(operator: PrintedOperator) -> PrintedOperator:
     return operator.linearized(torch.zeros_like(operator.tensors[0])).transposed()
 
 
-def matrix_by_loops(grid: Grid, kappa: Tensor, loss: Tensor) -> Tensor:
+def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
     """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin of the operator."""
-    shape = grid.shape
+    grid, shape = operator.grid, operator.grid.shape
     number = {cell: n for n, cell in enumerate(itertools.product(*map(range, shape)))}
     matrix = torch.zeros(len(number), len(number), dtype=kappa.dtype)
     for cell, row in number.items():
@@ -86,7 +88,7 @@ def matrix_of(operator: PrintedOperator) -> Tensor:
 def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, int]):
     operator = make_printed(box_grid(shape), contrast=30.0)
     kappa = 0.1 * 30.0 ** random_values(2, *shape, seed=1)[0]
-    expected = matrix_by_loops(box_grid(shape), kappa, 3 * random_values(2, *shape, seed=2)[0])
+    expected = matrix_by_loops(operator, kappa, 3 * random_values(2, *shape, seed=2)[0])
     torch.testing.assert_close(matrix_of(operator)[0], expected, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(
         matrix_of(transposed(operator))[0], expected.T, rtol=1e-12, atol=1e-12

@@ -261,7 +261,7 @@ def emit(scene: Scene) -> tuple[OutgoingLight, Rays]:
 
 
 def march_fast(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
-    return march_rays(outgoing, rays, every_ray(steps))
+    return march_rays(outgoing, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
 
 
 def march_twin(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
