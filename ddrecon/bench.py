@@ -56,7 +56,7 @@ QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 SPEED_COLUMNS = {"name": "", "image_seconds": ".3f", "both_seconds": ".3f", "times_base": ".2f"}
 SPEED_COLUMNS |= {"iterations": "", "image_numerical": ".1e", "gradient_numerical": ".1e"}
-SPEED_COLUMNS |= {"image_error": ""}
+SPEED_COLUMNS |= {"image_error": "", "best": ""}
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,8 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. A row is `best` where no other
+    is known to be faster and as close to the truth.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
@@ -174,6 +175,7 @@ def run_bench(
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
+    mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
     return {
         "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
@@ -215,6 +217,22 @@ def row_of(
         **errors,
         "image_error": None if truth is None else truth.error(shot.image.numpy()),
     }
+
+
+def mark_best(rows: list[dict[str, Any]], noise: float) -> None:
+    """Marks the `rows` that no other beats in both time of an image and error (Pareto).
+
+    An error against path tracing is at least what its `noise` can tell from none.
+    """
+
+    def error(row: dict[str, Any]) -> float:
+        if row["image_error"] is not None:
+            return max(row["image_error"], noise / 3)
+        return math.inf if row["image_numerical"] is None else row["image_numerical"]
+
+    for row in rows:
+        faster = (other for other in rows if other["image_seconds"] < row["image_seconds"])
+        row["best"] = "yes" if all(error(other) > error(row) for other in faster) else None
 
 
 def bench_lines(report: Mapping[str, Any]) -> list[str]:

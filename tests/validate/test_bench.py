@@ -19,6 +19,7 @@ from ddrecon.bench import (
     balance_of,
     bench_lines,
     find_failures,
+    mark_best,
     row_of,
     run_case,
     shoot,
@@ -101,14 +102,23 @@ def test_the_gradient_is_the_slope_of_the_mean_of_the_image() -> None:
     assert float(along) == pytest.approx((mean(1.0001) - mean(0.9999)) / 0.0002, rel=1e-4)
 
 
+def test_the_best_are_those_that_no_other_beats_in_both_time_and_error() -> None:
+    known = {"a": (1, 0.3), "b": (2, 0.4), "c": (3, 0.1), "d": (4, 0.1), "e": (5, 0.05)}
+    rows = [{"name": n, "image_seconds": t, "image_error": e} for n, (t, e) in known.items()]
+    mark_best(rows, 0.0)
+    assert [row["name"] for row in rows if row["best"]] == ["a", "c", "e"]
+
+
 def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
     image = torch.ones(3, 2, 2)
     truth = Traced(image.numpy(), 0.09)
     known = {"base": (1.02, 1.0), "slower": (1.0, 2.0), "Mitsuba 16 paths a pixel": (1.3, 72.0)}
     shots = {n: Shot(factor * image, None, time, 0.0, 16) for n, (factor, time) in known.items()}
     rows = [row_of(name, [shot], None, truth) for name, shot in shots.items()]
+    mark_best(rows, truth.noise)
     _, _, *lines, remark = bench_lines({"rows": rows, "truth_noise": truth.noise})
-    assert [line.rstrip(" |").split(" | ")[7] for line in lines] == ["< 0.03", "< 0.03", "0.286"]
+    assert [row["name"] for row in rows if row["best"]] == ["base"]
+    assert [line.split(" | ")[7] for line in lines] == ["< 0.03", "< 0.03", "0.286"]
     assert "16 paths a pixel take 72 times as long as base" in remark
 
 
