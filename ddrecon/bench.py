@@ -149,8 +149,8 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
     `rows`, seconds are medians, `both_seconds` of image and gradient, and errors relative RMS:
     `image_numerical` and `gradient_numerical` against the same model solved exactly, `image_error`
-    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. A row is `best` where no other
-    is known to be faster and as close to the truth.
+    against path tracing, whose noise, `truth_noise`, is subtracted in quadrature. A row is `best`
+    where no other is known to be faster and as close to the truth.
     """
     contestants: dict[str, Callable[[], Shot]] = {
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
