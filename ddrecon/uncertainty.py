@@ -17,12 +17,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
 from ddrecon.lighting import solve_light
+from ddrecon.numerics.interpolation import mean_around
 from ddrecon.picture import view_picture
 from ddrecon.pictures import LEAST
 from ddrecon.ranks import sum_over_ranks
@@ -301,16 +301,6 @@ class Field:
                 for k in (1, 2)
             },
         }
-
-
-def mean_around(field: Tensor, width: int) -> Tensor:
-    """The mean of `field` [..., z, y, x] over `width`^3 cells around each, `width` being odd.
-
-    Beyond the box there are no cells: those that there are count alone.
-    """
-    cells = field.reshape(1, -1, *field.shape[-3:])
-    means = avg_pool3d(cells, width, 1, width // 2, count_include_pad=False)
-    return means.view(field.shape)
 
 
 def volumes_in(folder: Path) -> list[Path]:

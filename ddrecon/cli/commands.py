@@ -416,6 +416,8 @@ def export(session: Session, source: tuple[Path, ...], file: Path, up: str | Non
     is_of_scene = kind not in WRITTEN or any(map(_is_scene, volumes))
     if is_of_scene and len(volumes) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
+    if kind not in WRITTEN and not _is_scene(volumes[0]):
+        raise click.UsageError(f"{volumes[0]}: is no scene, and {kind} is written of one")
     if kind not in WRITTEN and up:
         raise click.UsageError(f"--up {up} turns volumes only")
     may_exist, upright, lines = session.overwrite, "y", list[str]()

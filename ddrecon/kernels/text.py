@@ -139,9 +139,9 @@ class TextKernel:
             entries = zip(self.lists[name], value, strict=True) if is_list else ((name, value),)
             for entry, number in entries:
                 if isinstance(number, Tensor):
-                    dtype, is_plain = self.arrays.get(entry), number.is_contiguous()
-                    if name not in self.written and not (is_plain and number.dtype is dtype):
-                        number = number.to(dtype).contiguous()
+                    if name not in self.written:
+                        # Also where both fit: what torch.func has wrapped is unwrapped so.
+                        number = number.to(self.arrays.get(entry)).contiguous()
                     arrays.append(number)
                 self.write(record, entry, number)
         return arrays

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag, grid_sample, interpolate, pad
+from torch.nn.functional import avg_pool2d, avg_pool3d, embedding_bag, grid_sample, interpolate, pad
 
 from ddrecon.numerics.autodiff import is_forward
 
@@ -192,6 +192,18 @@ def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None)
             correction = pad(correction, [0] * 2 * (values.ndim - 1) + [border] * 2)
             fine[i] = third_order.correct(fine[i], correction)
     return torch.cat([torch.stack(fine, 1).flatten(0, 1), values[-1:]])
+
+
+def mean_around(field: Tensor, width: int, count: int = 3) -> Tensor:
+    """The mean of `field` over `width` entries around each along each of its last `count` axes.
+
+    `width` is odd, `count` 2 or 3. Beyond the field there are no entries: those that there are
+    count alone, and an axis may be shorter than `width`.
+    """
+    pool, border = avg_pool3d if count == 3 else avg_pool2d, (width // 2,) * (2 * count)
+    entries = field.reshape(1, -1, *field.shape[-count:])
+    sums, counts = (pool(pad(x, border), width, 1) for x in (entries, torch.ones_like(entries)))
+    return (sums / counts).view_as(field)
 
 
 def second_difference(values: Tensor, axis: int) -> Tensor:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from ddrecon.cameras import Camera
 from ddrecon.diffusion.implicit import SolveMemory
@@ -29,6 +28,7 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.lighting import solve_light
+from ddrecon.numerics.interpolation import mean_around
 from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
@@ -79,9 +79,7 @@ def find_diagonals(
 
 def _smooth(squares: Tensor, count: int) -> Tensor:
     """`squares` averaged over neighbors along the last `count` axes, and not too small."""
-    pool = avg_pool3d if count == 3 else avg_pool2d
-    colors = squares.reshape(1, -1, *squares.shape[-count:])
-    mean = pool(colors, 3, 1, 1, count_include_pad=False).view_as(squares)
+    mean = mean_around(squares, 3, count)
     unit = mean.double().square().mean().sqrt().to(mean) + torch.finfo(mean.dtype).tiny
     return unit * (mean / unit).clamp(min=tuning.FLOOR) ** tuning.POWER
 

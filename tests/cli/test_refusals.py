@@ -74,6 +74,7 @@ bench gone.yaml => 2 gone.yaml: cannot be read
 bench -q --hard -o scene.yaml => 2 scene.yaml: is a file
 reference scene.yaml -o out --spp 3 => 2 Error: Invalid value for '--spp'
 export density.npz -o smoke.obj => 2 -o smoke.obj: unknown format '.obj'; known: .xml, .json
+export density.npz -o smoke.xml => 2 Error: density.npz: is no scene, and .xml is written of one
 export density.npz -o smoke.nc => 2 -o smoke.nc: unknown format '.nc'; known: .xml, .json
 export scene.yaml scene.yaml -o smoke.xml => 2 Error: one scene at a time is written as .xml
 export scene.yaml -o a.xml --up z => 2 Error: --up z turns volumes only

@@ -11,7 +11,13 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.numerics.interpolation import ThirdOrder, sample_slices, sample_volume, subdivide
+from ddrecon.numerics.interpolation import (
+    ThirdOrder,
+    mean_around,
+    sample_slices,
+    sample_volume,
+    subdivide,
+)
 
 
 def interpolated(values: Tensor, point: Tensor) -> Tensor:
@@ -151,3 +157,18 @@ def test_a_motion_of_whole_cells_shifts() -> None:
     inner = (slice(None), slice(None), slice(2, None), slice(0, -1))
     torch.testing.assert_close(carried[inner], expected[inner], rtol=0, atol=1e-12)
     assert carried.max() <= field.max() and carried.min() >= field.min()
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 6), (2, 1, 5), (1, 1, 1)])
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_mean_around_an_entry_is_that_of_the_entries_that_there_are(
+    shape: tuple[int, ...], count: int
+) -> None:
+    """Also where an axis is shorter than what is averaged."""
+    field = random_values(2, *shape)
+    means = mean_around(field, 3, count)
+    for place in itertools.product(*map(range, shape)):
+        near = [slice(max(at - 1, 0), at + 2) for at in place[3 - count :]]
+        rest = (slice(None), *place[: 3 - count])
+        true = field[rest][:, *near].mean(tuple(range(1, 1 + count)))
+        torch.testing.assert_close(means[:, *place], true)

@@ -17,7 +17,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty import RATIO, Field, Uncertainty, mean_around
+from ddrecon.uncertainty import RATIO, Field, Uncertainty
 
 SHAPE = (12, 14, 10)
 GRID = Grid(SHAPE, (0.0, 0.0, 0.0), (1.2, 1.4, 1.0))
@@ -116,14 +116,6 @@ def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(
     mass, volume = numbers["mass of density"], 1.2 * 1.4 * 1.0
     assert mass["value"] == pytest.approx(volume * float(value.clamp(min=0).mean()))
     assert mass["deviation"] == pytest.approx(RATIO * 3 * 0.2 * volume)
-
-
-def test_a_mean_around_a_cell_is_that_of_the_cells_that_there_are() -> None:
-    field = random_values(2, 3, 4, 6)
-    means = mean_around(field, 3)
-    for z, y, x in ((0, 0, 0), (1, 2, 3), (2, 3, 5)):
-        near = [slice(max(at - 1, 0), at + 2) for at in (z, y, x)]
-        torch.testing.assert_close(means[:, z, y, x], field[:, *near].mean((-3, -2, -1)))
 
 
 def test_a_deviation_is_the_root_mean_square_of_the_errors_around_less_what_experiments_lack() -> (
