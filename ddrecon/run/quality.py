@@ -44,6 +44,8 @@ LARGEST_STEP = 40.0
 """No step is farther than so many rates, of a quarter of a pixel."""
 OVERFIT = 6.0
 """Held-out views this much worse than those trained on [dB] are not explained by noise."""
+UNEXPLAINED = 4.0
+"""Images this many times farther off than noise and the model's own error are of another scene."""
 FACTOR = 1.15
 """A view whose brightness is off by this factor, against the others, was exposed differently."""
 SHIFT = 0.5
@@ -197,11 +199,13 @@ def diagnose(
     gain: float,
     support: Support | None = None,
     doubt: str | None = None,
+    misfit: float = 1.0,
 ) -> list[dict[str, str]]:
     """What seems to be wrong with a run, by its `findings`.
 
     After so many iterations the loss can fall by its part `gain`; `support` is where density was
-    sought, and `doubt` what is odd in its box. Each is a word that names its `kind`, and a
+    sought, and `doubt` what is odd in its box; images are off by `misfit` times what noise and the
+    model's own error explain. Each is a word that names its `kind`, and a
     sentence, its `text`.
     """
     scene, quality = findings.scene, findings.quality
@@ -222,6 +226,11 @@ def diagnose(
         texts |= find_odd(train, findings.images, gain)
     if not (texts["empty"] or overfit):  # which would only become more so
         texts["unfinished"] = find_unfinished(gain, iteration)
+    if misfit > UNEXPLAINED and not any(texts.values()):
+        texts["unexplained"] = (
+            f"unexplained: at rest, images are off by {misfit:.1f} times what noise and the model's "
+            "own error explain; check the directions and strengths of lights, albedo and g"
+        )
     return [{"kind": kind, "text": text} for kind, text in texts.items() if text]
 
 

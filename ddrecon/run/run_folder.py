@@ -148,7 +148,10 @@ class Run(Job):
         if seen:
             summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
         fall, doubt = (run.iteration, run.search.gain), summary.get("support", {}).get("doubt")
-        summary["diagnoses"] = diagnose(findings, *fall, support, doubt)
+        ended, misfit = summary["ended"], 1.0
+        if ended["kind"] == "rest":
+            misfit = ended["residual"] / ended["noise"]
+        summary["diagnoses"] = diagnose(findings, *fall, support, doubt, misfit)
         self._report(findings, summary)
         write_json(path / SUMMARY, summary)
         lines = [
