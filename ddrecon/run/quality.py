@@ -228,8 +228,8 @@ def diagnose(
         texts["unfinished"] = find_unfinished(gain, iteration)
     if misfit > UNEXPLAINED and not any(texts.values()):
         texts["unexplained"] = (
-            f"unexplained: at rest, images are off by {misfit:.1f} times what noise and the model's "
-            "own error explain; check the directions and strengths of lights, albedo and g"
+            f"unexplained: at rest, images are off by {misfit:.1f} times what noise and the "
+            "model's own error explain; check the directions and strengths of lights, albedo and g"
         )
     return [{"kind": kind, "text": text} for kind, text in texts.items() if text]
 
