@@ -204,8 +204,8 @@ class Frame:
             **({"test_psnr": None} | quality),
         )
         if not is_accepted:
-            kept = "loss", "data_loss", "penalty", "psnr"
-            row = replace(row, **{name: getattr(self.total, name) for name in kept})
+            names = "loss", "data_loss", "penalty", "psnr"
+            row = replace(row, **{name: getattr(self.total, name) for name in names})
         self.total = row.after(self.total)
         return row
 

@@ -227,11 +227,9 @@ def compare_to_folder(
         report["seconds"] = {"light": perf_counter() - start}
     for index, view in enumerate(views):
         start = perf_counter()
-        images = [
-            tracer.trace(index, (seed * passes + number) % SEEDS, samples_per_pass)
-            for number in progress(range(passes), view.name)
-        ]
-        traced = Traced.of(images)
+        seeds = [(seed * passes + number) % SEEDS for number in range(passes)]
+        pass_seeds = progress(seeds, view.name)
+        traced = Traced.of([tracer.trace(index, number, samples_per_pass) for number in pass_seeds])
         seconds = {"reference": perf_counter() - start}
         measured: dict[str, Any] = {"noise": traced.noise, "seconds": seconds}
         if scene is None:

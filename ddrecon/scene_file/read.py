@@ -357,10 +357,10 @@ def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     entries = node.entries()
     if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
         needs = [(kind, [key.name for key in fields(kind) if is_required(key)]) for kind in kinds]
-        told = {kind: name for kind, names in needs for name in names if name in entries}
-        if len(told) > 1:
-            raise node.refused(f"give only one of {' or '.join(told.values())}")
-        return next(iter(told), kinds[0])
+        named = {kind: name for kind, names in needs for name in names if name in entries}
+        if len(named) > 1:
+            raise node.refused(f"give only one of {' or '.join(named.values())}")
+        return next(iter(named), kinds[0])
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}
