@@ -136,8 +136,8 @@ def draw_uses(runs: Path) -> None:
     for name, text in USES.items():
         if name == "cloud":
             image = iio.imread(DOCS / "pictures" / "cloud.png")[..., :3] / np.float32(255)
-            parts = json.loads((runs / name / "render.json").read_text())["seconds"]
-            seconds = parts["light"] + sum(parts["views"].values())
+            stages = json.loads((runs / name / "render.json").read_text())["seconds"]
+            seconds = stages["light"] + sum(stages["views"].values())
         else:
             image = display(look_around(runs / name, FIGURES[name])[1])
             seconds = json.loads((runs / name / "summary.json").read_text())["seconds"]

@@ -132,12 +132,12 @@ def test_why_a_volume_is_empty_is_told(gain: float, advice: str) -> None:
     assert "empty" not in [each["kind"] for each in diagnose(seen, 3, gain)]
 
 
-@pytest.mark.parametrize(("misfit", "told"), [(3.0, []), (5.0, ["unexplained"])])
+@pytest.mark.parametrize(("misfit", "kinds"), [(3.0, []), (5.0, ["unexplained"])])
 def test_pictures_that_a_run_at_rest_does_not_explain_are_told(
-    misfit: float, told: list[str]
+    misfit: float, kinds: list[str]
 ) -> None:
     diagnoses = diagnose(findings_of(make_scene()), *AT_REST, misfit=misfit)
-    assert [diagnosis["kind"] for diagnosis in diagnoses] == told
+    assert [diagnosis["kind"] for diagnosis in diagnoses] == kinds
 
 
 @pytest.mark.parametrize("rows", [0, 4])

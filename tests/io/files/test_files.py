@@ -184,30 +184,26 @@ def test_what_is_removed_is_what_was_written(tmp_path: Path) -> None:
     assert set(contents(tmp_path)) == {MANIFEST, "deep/mine"}
 
 
+def assert_refused(path: Path, kind: str, text: str, *ways: dict[str, bool]) -> None:
+    """No job of this `kind` begins in the folder `path`, in whatever way, and nothing changes."""
+    before = contents(path)
+    for way in ways:
+        with pytest.raises(UsageError, match=text), claim_folder(path, kind, **way):
+            pass
+    assert contents(path) == before
+
+
 @pytest.mark.parametrize(("there", "kind"), [*permutations(KINDS, 2)])
 def test_a_folder_of_another_kind_is_refused(tmp_path: Path, there: str, kind: str) -> None:
     fill(tmp_path, there, "report.html")
-    before = contents(tmp_path)
-    for how in ({"overwrite": True}, {"resume": True}, {}):
-        with (
-            pytest.raises(UsageError, match=f"another kind of job, {there}; choose another folder"),
-            claim_folder(tmp_path, kind, **how),
-        ):
-            pass
-    assert contents(tmp_path) == before
+    text = f"another kind of job, {there}; choose another folder"
+    assert_refused(tmp_path, kind, text, {"overwrite": True}, {"resume": True}, {})
 
 
 def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text("mine")
     (tmp_path / MANIFEST).write_text("ddrecon strange\nscene.yaml\n")
-    before = contents(tmp_path)
-    for how in ({"resume": True}, {}):
-        with (
-            pytest.raises(UsageError, match=r"holds scene.yaml, which ddrecon did not write"),
-            claim_folder(tmp_path, RUN, **how),
-        ):
-            pass
-    assert contents(tmp_path) == before
+    assert_refused(tmp_path, RUN, "holds scene.yaml, which ddrecon did not", {"resume": True}, {})
 
 
 def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
