@@ -224,10 +224,10 @@ def march_periods(
                 for total, change in zip((radiance, mass), more, strict=True)
             )
         depth = (scale * mass[:, number]).detach().amin(0)
-        left = ((far > end) & (depth < OPAQUE)).nonzero()[:, 0]
+        onward_rays = ((far > end) & (depth < OPAQUE)).nonzero()[:, 0]
         onward = (
             axis[..., None] == torch.arange(3, device=axis.device)
         ) * direction.detach().sign()
-        copy, number = (copy + onward)[left], number[left]
-        rays, near, far = rays.select(left), end[left], far[left]
+        copy, number = (copy + onward)[onward_rays], number[onward_rays]
+        rays, near, far = rays.select(onward_rays), end[onward_rays], far[onward_rays]
     return radiance, mass

@@ -168,8 +168,8 @@ def fit_held_out(
             solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
             values = solution.to(light).split([sizes[key] for key in keys])
             fit = response | dict(zip(keys, values, strict=True))
-            shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
-            tried.append((shown, fit))
+            picture = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
+            tried.append((picture, fit))
     fitted, best = max(tried, key=lambda attempt: float(target.psnr_of(attempt[0])))
     return fitted, {key: best[key] for key in sizes}
 

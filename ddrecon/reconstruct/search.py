@@ -201,7 +201,7 @@ class Search:
         lengths: Sequence[float | Tensor] = self.scales or [1.0] * len(sizes)
         for product in promised:
             groups = zip(*(x.split(sizes) for x in (*pairs[-1][:2], product)), strict=True)
-            ratios = [_dot(change, move) / _dot(change, own) for move, change, own in groups]
+            ratios = [_dot(change, move) / _dot(change, step) for move, change, step in groups]
             known = zip(ratios, lengths, strict=True)
             lengths = [torch.where(ratio > 0, ratio, length) for ratio, length in known]
         scaled = zip(result.split(sizes), lengths, strict=True)
