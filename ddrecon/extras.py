@@ -15,6 +15,7 @@ EXTRAS = {
     "warp": "fast",
     "miepython": "mie",
     "imageio_ffmpeg": "film",
+    "blosc": "vdb",
 }
 """Which extra of ddrecon brings which package."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ def describe(path: Path) -> dict[str, Any]:
         report = describe_medium(values, {}, bounds)
         for name, field in fields.items():
             report["fields"][name] |= {"unit": field.unit} if field.unit else {}
+            report["fields"][name] |= {"labels": field.labels} if field.labels else {}
         return report | ({"no_fields": reasons} if reasons else {})
     image = read_image(path)
     height, width = image.size
@@ -78,16 +80,24 @@ def lines(report: dict[str, Any]) -> list[str]:
         box = f" of {box_text(report['resolution'], report['bounds'])}"
     return [
         f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
+        *chain.from_iterable(_field_lines(*pair) for pair in report["fields"].items()),
         *(
-            f"{name}: {_values(of_field, f'more than {EMPTY:g} of the largest')}"
-            for name, of_field in report["fields"].items()
-        ),
-        *(
-            f"{name}: {' '.join(f'{number:.4g}' for number in np.atleast_1d(value))} everywhere"
+            f"{name}: {_numbers_text(value)} everywhere"
             for name, value in report.get("constants", {}).items()
         ),
         *(f"no field: {reason}" for reason in report.get("no_fields", {}).values()),
     ]
+
+
+def _field_lines(name: str, report: dict[str, Any]) -> Iterator[str]:
+    yield f"{name}: {_values(report, f'more than {EMPTY:g} of the largest')}"
+    labels = report.get("labels", {}).items()
+    if texts := [f"{key} {x if isinstance(x, str) else _numbers_text(x)}" for key, x in labels]:
+        yield f"  metadata: {'; '.join(texts)}"
+
+
+def _numbers_text(numbers: Any) -> str:
+    return " ".join(f"{number:.4g}" for number in np.atleast_1d(numbers))
 
 
 def _values(report: dict[str, Any], filled: str, about: str = "") -> str:

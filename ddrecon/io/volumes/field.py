@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,13 +35,14 @@ class Field:
 
     `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
     so is how many `meters` a u has; `unit` is that of the values, as it spells it, "" where it
-    could say one.
+    could say one, and `labels` are what else it says of the field: texts, or lists of numbers.
     """
 
     values: np.ndarray
     bounds: np.ndarray | None = None
     unit: str | None = None
     meters: float | None = None
+    labels: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def resolution(self) -> tuple[int, int, int]:

@@ -27,17 +27,17 @@ import uuid
 import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
+from ddrecon.extras import load_for_file
 from ddrecon.io.files.atomic import write_bytes
 from ddrecon.io.files.reading import as_float32, check_size
-from ddrecon.io.volumes.blosc import Stream, unpack_blosc
 from ddrecon.io.volumes.field import VECTORS, Facts, Field, Fields, check_field, prune
 
 MAGIC, HEADER = 0x56444220, "<qIIIB"
@@ -59,13 +59,11 @@ SIDE, VOXELS = 2**LEAF, 2 ** (3 * LEAF)
 """Voxels of a leaf: along a side, and in all."""
 NUMBERS = {"half": "<f2", "float": "<f4", "double": "<f8", "vec3s": "<f4", "vec3d": "<f8"}
 """The numbers of a value, by its type."""
+LABELS = {**NUMBERS, "bool": "?", "int32": "<i4", "int64": "<i8", "vec3i": "<i4"}
+"""The numbers of metadata, by its type; besides, there are texts."""
 TREE = re.compile(f"Tree_({'|'.join(NUMBERS)})_5_4_3(_HalfFloat)?")
-MAPS = {
-    "TranslationMap": 3,
-    **dict.fromkeys(("UniformScaleMap", "ScaleMap"), 15),
-    **dict.fromkeys(("UnitaryMap", "AffineMap"), 16),
-    **dict.fromkeys(("UniformScaleTranslateMap", "ScaleTranslateMap"), 18),
-}
+MAPS = {"TranslationMap": 3, "UniformScaleMap": 15, "ScaleMap": 15, "UnitaryMap": 16}
+MAPS |= {"AffineMap": 16, "UniformScaleTranslateMap": 18, "ScaleTranslateMap": 18}
 """How many numbers a transform has, by its type."""
 STEEPEST = 1e6
 """Steps whose matrix has a larger condition are no axes."""
@@ -80,7 +78,41 @@ NOWHERE = np.array([[FAR] * 3, [-FAR] * 3])
 """A box that holds nothing."""
 
 
-Slices = tuple[slice, ...]
+class Stream:
+    """The bytes `data` of the file at `path`, from the place `at` on; ValueError where they end."""
+
+    def __init__(self, path: Path, data: bytes):
+        self.path, self.data, self.at = path, data, 0
+
+    def read(self, count: int) -> bytes:
+        start, self.at = self.at, self.at + count
+        if not 0 <= start <= self.at <= len(self.data):
+            raise ValueError("cut short")
+        return self.data[start : self.at]
+
+    def unpack(self, layout: str) -> tuple[Any, ...]:
+        return struct.unpack(layout, self.read(struct.calcsize(layout)))
+
+    def array(self, kind: np.dtype, count: int) -> np.ndarray:
+        return np.frombuffer(self.read(kind.itemsize * count), kind)
+
+    def text(self) -> str:
+        return self.read(*self.unpack("<I")).decode()
+
+    def metadata(self) -> dict[str, Any]:
+        """Texts, and lists of numbers, by name."""
+        labels = dict[str, Any]()
+        for _ in range(*self.unpack("<I")):
+            name, kind, data = self.text(), self.text(), self.read(*self.unpack("<I"))
+            if kind == "string":
+                labels[name] = data.decode(errors="replace")
+            elif kind in LABELS:
+                labels[name] = np.frombuffer(data, LABELS[kind]).tolist()
+        return labels
+
+    def bits(self, count: int) -> np.ndarray:
+        """Whether each of the next `count` is on, [count]."""
+        return np.unpackbits(self.array(np.dtype(np.uint8), count // 8), bitorder="little") > 0
 
 
 class Nodes(NamedTuple):
@@ -128,7 +160,7 @@ class Grid:
     tree: str
     parent: str
     flags: int
-    labels: Mapping[str, bytes]
+    labels: Mapping[str, Any]
     map: str
     steps: np.ndarray
     origin: np.ndarray
@@ -143,9 +175,9 @@ class Grid:
     @property
     def fault(self) -> str:
         """Why it cannot be read, "" where it can."""
-        if self.labels.get("class") == b"level set":
+        if self.labels.get("class") == "level set":
             return "is a level set (distances): convert it to a fog volume first"
-        if self.labels.get("class") == b"staggered":
+        if self.labels.get("class") == "staggered":
             return "is staggered (values on faces): resample it to centers of voxels first"
         if not TREE.fullmatch(self.tree):
             return f"is of type {self.tree}; Tree_..._5_4_3 of {', '.join(NUMBERS)} are read"
@@ -157,6 +189,16 @@ class Grid:
             return "has a transform without three axes"
         return ""
 
+    def legal(self, values: np.ndarray, bounds: np.ndarray) -> Field:
+        """The field of its `values` in a box, and its metadata but for what tells of the file."""
+        of_file = "name", RESOLUTION, "is_local_space"
+        labels = {
+            name: label
+            for name, label in self.labels.items()
+            if name not in of_file and not name.startswith("file_")
+        }
+        return replace(check_field(self.stream.path, self.name, values, bounds), labels=labels)
+
     def check_cells(self, cells: np.ndarray) -> None:
         """Raises FormatError where so many `cells` (x, y, z) take too much memory."""
         size, text = 4 * self.components * math.prod(cells.tolist()), " x ".join(map(str, cells))
@@ -164,28 +206,33 @@ class Grid:
 
     def measure(self) -> np.ndarray:
         """The box [2, 3] of the voxels that are active, or cells of ours."""
-        box, cells = NOWHERE, self.labels.get(RESOLUTION, b"")
-        if len(cells) == 12 and min(sides := struct.unpack("<3i", cells)) > 0:
-            box = np.array([[0, 0, 0], sides])
+        box, cells = NOWHERE, self.labels.get(RESOLUTION, [0])
+        if len(cells) == 3 and min(cells) > 0:
+            box = np.array([[0, 0, 0], cells])
         return reduce(join, (nodes.measure() for nodes in self.read_topology()), box)
 
     def fill(self, values: np.ndarray, low: np.ndarray) -> None:
         """Writes the tree's values to `values` [x, y, z, C], the voxels from the index `low` on."""
         leaves = list[list[int]]()
+
+        def inside(start: list[int], side: int) -> tuple[slice, ...]:
+            return tuple(slice(max(at, 0), max(at + side, 0)) for at in start)
+
         for nodes in self.read_topology():
             starts = (nodes.corners - low).tolist()
             if nodes.values is None:
                 leaves += starts
                 continue
             for start, value in zip(starts, nodes.values, strict=True):
-                values[_overlap(start, nodes.side, values.shape)[0]] = value
+                values[inside(start, nodes.side)] = value
         for start in leaves:
             is_active, buffers = self.stream.bits(VOXELS), 1
             if self.version < NODE_MASKS:
                 *_, buffers = self.stream.unpack("<3ib")
             block = self.read_masked(is_active).reshape(SIDE, SIDE, SIDE, -1)
-            place, inside = _overlap(start, SIDE, values.shape)
-            values[place] = block[inside]
+            pairs = zip(start, values.shape, strict=False)
+            within = tuple(slice(max(-at, 0), max(size - at, 0)) for at, size in pairs)
+            values[inside(start, SIDE)] = block[within]
             for _ in range(buffers - 1):  # of a simulation, of which the first counts
                 self.read_many(VOXELS)
 
@@ -263,24 +310,16 @@ class Grid:
         else:
             (packed,) = stream.unpack("<q")
             data = stream.read(abs(packed))
+            # No more is unpacked than there should be, of a bomb.
             if packed > 0 and self.flags & BLOSC:
-                data = unpack_blosc(stream.path, data, size)
+                blosc = load_for_file("blosc", stream.path)
+                is_whole = struct.unpack_from("<I", data, 4) == (size,)
+                data = blosc.decompress(data) if is_whole else b""
             elif packed > 0:
-                data = zlib.decompressobj().decompress(data, size + 1)  # no more, of a bomb
+                data = zlib.decompressobj().decompress(data, size + 1)
         if len(data) != size:
             raise ValueError(f"values of {size} bytes have {len(data)}")
         return np.frombuffer(data, self.stored).reshape(count, self.components)
-
-
-def _overlap(start: list[int], side: int, shape: tuple[int, ...]) -> tuple[Slices, Slices]:
-    """Where a cube of `side` voxels from `start` on meets an array of `shape`: there, and in it."""
-    place, inside = list[slice](), list[slice]()
-    for first, size in zip(start, shape, strict=False):
-        low = max(first, 0)
-        high = max(low, min(first + side, size))
-        place.append(slice(low, high))
-        inside.append(slice(low - first, high - first))
-    return tuple(place), tuple(inside)
 
 
 def _read_map(stream: Stream, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -364,7 +403,7 @@ def read_vdb(path: Path, name: str) -> Field:
     grid.fill(values.transpose(2, 1, 0, 3)[flips].transpose(*np.argsort(order), 3), box[0])
     corner = center - grid.steps.sum(0) / 2
     bounds = np.sort([corner, corner + sides @ grid.steps], axis=0)
-    return check_field(path, name, values, bounds)
+    return grid.legal(values, bounds)
 
 
 def _place(grid: Grid, grids: Iterable[Grid]) -> tuple[np.ndarray, np.ndarray]:
@@ -419,7 +458,7 @@ def _read_turned(grid: Grid, sides: np.ndarray, low: np.ndarray, center: np.ndar
         for corner in itertools.product((0, 1), repeat=3):
             weight = np.abs(1 - np.array(corner) - (index - first)).prod(-1, keepdims=True)
             layer += weight * source[tuple(np.moveaxis(first + corner, -1, 0))]
-    return check_field(grid.stream.path, grid.name, values, bounds)
+    return grid.legal(values, bounds)
 
 
 def write_vdb(path: Path, fields: Fields, bounds: np.ndarray, facts: Facts) -> None:

@@ -48,13 +48,39 @@ def test_openvdb_knows_facts_and_what_vectors_are(tmp_path: Path) -> None:
     vectors = dict.fromkeys(("velocity", "albedo"), sparse(9, 4, 5, 3))
     path = written(tmp_path / "smoke.vdb", facts, density=sparse(9, 4, 5), **vectors)
     told = "[[g['sigma_t'], g['g'], g['units']] for g in grids.values()]"
-    assert openvdb_python.described(told, path) == 3 * [[[1.5, 2, 4], 0.1, facts["units"]]]
+    values = [1.5, 2, 4], 0.1, facts["units"]
+    assert openvdb_python.described(told, path) == 3 * [[*values]]
     kinds = "{n: [g.gridClass, g.metadata.get('vector_type')] for n, g in grids.items()}"
     assert openvdb_python.described(kinds, path) == {
         "density": ["fog volume", None],
         "albedo": ["fog volume", None],
         "velocity": ["unknown", "contravariant relative"],
     }
+
+
+def test_facts_come_back_as_labels(tmp_path: Path) -> None:
+    """Those of OpenVDB's library too, of every type; what tells of the file alone is left out."""
+    facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.1), "units": "sigma_t [1/u] µ"}
+    path = written(tmp_path / "smoke.vdb", facts, density=sparse(9, 4, 5))
+    labels = {"sigma_t": [1.5, 2, 4], "g": [0.1], "units": facts["units"], "class": "fog volume"}
+    assert read_field(path, "density").labels == labels
+    openvdb_python.run(LABEL, tmp_path)
+    read = read_field(tmp_path / "theirs.vdb", "density").labels
+    assert read["a"] == [True] and read["b"] == [-3] and read["c"] == [0.5] and read["d"] == "é"
+    assert not {"name", "file_voxel_count"} & {*read}
+
+
+LABEL = """
+import sys
+try: import openvdb as vdb
+except ImportError: import pyopenvdb as vdb
+grid = vdb.FloatGrid()
+grid.name = "density"
+grid.fill((0, 0, 0), (3, 3, 3), 1.0)
+for name, value in {"a": True, "b": -3, "c": 0.5, "d": "é"}.items():
+    grid[name] = value
+vdb.write(f"{sys.argv[1]}/theirs.vdb", [grid])
+"""
 
 
 def test_only_leaves_that_hold_something_are_there(tmp_path: Path) -> None:

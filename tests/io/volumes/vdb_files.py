@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 Place = tuple[int, int, int]
 Array = np.ndarray
@@ -188,8 +189,13 @@ class Encoder:
         data = values.astype(self.stored).tobytes()
         if not self.grid.flags & 5 or (self.grid.is_half and not len(values)):
             return data
-        packed = pack_blosc(data) if self.grid.flags & 4 else zlib.compress(data)
-        if len(packed) >= len(data) and not self.grid.flags & 4:
+        if self.grid.flags & 4:
+            # As OpenVDB does, of LZ4, numbers of four bytes whatever they are.
+            blosc = pytest.importorskip("blosc", reason="no blosc (extra `vdb`)")
+            packed = blosc.compress(data, typesize=4, cname="lz4") if data else b""
+        else:
+            packed = zlib.compress(data)
+        if len(packed) >= len(data):
             return struct.pack("<q", -len(data)) + data
         return struct.pack("<q", len(packed)) + packed
 
@@ -210,59 +216,3 @@ def text(words: str) -> bytes:
 def metadata(entries: dict[str, str]) -> bytes:
     records = [text(name) + text("string") + text(value) for name, value in entries.items()]
     return struct.pack("<I", len(records)) + b"".join(records)
-
-
-def pack_blosc(data: bytes, width: int = 4, block: int | None = None, flags: int = 1) -> bytes:
-    """A chunk of Blosc: bytes of numbers shuffled (1), plain (2), blocks not split (16)."""
-    block = min(block or len(data), len(data)) or 1
-    block = block // width * width or block
-    head = struct.pack("<4B2I", 2, 1, flags | 1 << 5, width, len(data), block)
-    if flags & 2 or not data:
-        return head + struct.pack("<I", 16 + len(data)) + data
-    blocks = [data[start : start + block] for start in range(0, len(data), block)]
-    body, places = b"", []
-    for part in blocks:
-        places.append(16 + 4 * len(blocks) + len(body))
-        if flags & 1:
-            whole = len(part) // width * width
-            rows = [part[first:whole:width] for first in range(width)]
-            part = b"".join(rows) + part[whole:]
-        is_split = not flags & 16 and len(part) == block and block // width >= 128
-        share = len(part) // width if is_split else len(part)
-        for start in range(0, len(part), share):
-            packed = pack_lz4(part[start : start + share])
-            if len(packed) >= share:
-                packed = part[start : start + share]
-            body += struct.pack("<I", len(packed)) + packed
-    size = 16 + 4 * len(blocks) + len(body)
-    return head + struct.pack(f"<I{len(blocks)}I", size, *places) + body
-
-
-def pack_lz4(data: bytes) -> bytes:
-    """A block of LZ4: greedy, and the last five bytes are literals, as its authors ask."""
-    packed, at, start, seen = bytearray(), 0, 0, dict[bytes, int]()
-    while at < len(data) - 12:
-        match = seen.get(data[at : at + 4], -1)
-        seen[data[at : at + 4]] = at
-        if match < 0 or at - match > 65535:
-            at += 1
-            continue
-        length = 4
-        while at + length < len(data) - 5 and data[match + length] == data[at + length]:
-            length += 1
-        packed += sequence(data[start:at], length - 4) + struct.pack("<H", at - match)
-        packed += excess(length - 4)
-        at = start = at + length
-    return bytes(packed + sequence(data[start:], 0))
-
-
-def sequence(literals: bytes, repeats: int) -> bytes:
-    token = min(len(literals), 15) << 4 | min(repeats, 15)
-    return bytes([token]) + excess(len(literals)) + literals
-
-
-def excess(count: int) -> bytes:
-    """What of a count is beyond the 15 of a token."""
-    if count < 15:
-        return b""
-    return b"\xff" * ((count - 15) // 255) + bytes([(count - 15) % 255])
