@@ -485,7 +485,8 @@ def drive_film(
     """
     due, finished = 0.0, film.done()
     if stay := [str(number) for number in numbers if number in finished]:
-        say(f"frames that are finished stay as they are: {', '.join(stay)}")
+        anew = f"--frames {stay[0]}:{stay[0]} --overwrite makes one anew"
+        say(f"frames that are finished stay as they are: {', '.join(stay)} ({anew})")
     try:
         for number in drive_frames(film, folder, numbers):
             if number not in finished and monotonic() >= due:

@@ -90,7 +90,9 @@ def import_scene(source: Path, path: Path, *, may_exist: bool) -> list[Path]:
                 sky, lights[-1]["file"] = lights[-1]["file"], picture.name
         views = [_view(module, sensor) for sensor in scene.sensors()]
     except (SceneError, RuntimeError) as error:
-        raise FormatError(source, " ".join(str(error).split())) from error
+        # Mitsuba's own words begin with a place in its code.
+        text = re.sub(r"^\[\w+\.cpp:\d+\]", "Mitsuba cannot load it:", str(error))
+        raise FormatError(source, " ".join(text.split())) from error
     written = [path, stored, *([] if sky is None else [picture])]
     require_free_files(written, may_exist=may_exist)
     write_fields(stored, fields, bounds)

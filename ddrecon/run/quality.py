@@ -77,6 +77,20 @@ class Findings:
         """The views that have a target."""
         return [view for view in self.scene.views if view.image is not None]
 
+    def means(self) -> dict[str, Any]:
+        """Means over training views, over test views (`test_psnr`), and of `registered` ones.
+
+        They are of whole pictures; those of iterations are of pixels as the run averages them.
+        """
+        means = dict[str, Any]()
+        for split, prefix in (("train", ""), ("test", "test_")):
+            rows = [row for row in self.quality.values() if row["split"] == split]
+            if rows:
+                means |= {f"{prefix}{k}": mean(row[k] for row in rows) for k in ("psnr", "ssim")}
+        if seen := [row["registered"] for row in self.quality.values() if "registered" in row]:
+            means["registered"] = {key: mean(row[key] for row in seen) for key in seen[0]}
+        return means
+
 
 def find_results(run: Reconstruction, is_last: bool = False) -> Findings:
     """The current result of `run`, rendered; if it `is_last`, held-out views are registered."""

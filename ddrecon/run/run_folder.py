@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import astuple, fields
 from pathlib import Path
-from statistics import mean
 from time import monotonic
 from typing import Any
 
@@ -118,9 +117,8 @@ class Run(Job):
             write_previews(self.path, find_results(self.run), f".{row.iteration:06d}")
         start = monotonic()
         if start >= self.next_page and not self.is_done:
-            self._report(
-                find_results(self.run), self._summary() | {"ended": GOES_ON, "diagnoses": []}
-            )
+            findings = find_results(self.run)
+            self._report(findings, self._summary(findings) | {"ended": GOES_ON, "diagnoses": []})
             self.next_page = monotonic() + max(PAGE_SECONDS, (monotonic() - start) / PAGE_SHARE)
         test_psnr = self.run.total.test_psnr
         return f"PSNR {row.psnr:.1f}{'' if test_psnr is None else f'/{test_psnr:.1f}'} dB"
@@ -143,10 +141,7 @@ class Run(Job):
         dump_scene(describe_result(self.scene_file, scene, values), path / RESULT)
         write_json(path / "parameters.json", _list_parameters(path, scene, values))
         write_previews(path, findings, "")
-        summary = self._summary() | {"views": findings.quality}
-        seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
-        if seen:
-            summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
+        summary = self._summary(findings) | {"views": findings.quality}
         fall, doubt = (run.iteration, run.search.gain), summary.get("support", {}).get("doubt")
         ended, misfit = summary["ended"], 1.0
         if ended["kind"] == "rest":
@@ -162,9 +157,9 @@ class Run(Job):
         lines += [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
         return summary, [*lines, *(diagnosis["text"] for diagnosis in summary["diagnoses"])]
 
-    def _summary(self) -> dict[str, Any]:
+    def _summary(self, findings: Findings) -> dict[str, Any]:
         problem, total = self.run.problem, dict(vars(self.run.total))
-        summary = {"iterations": total.pop("iteration"), **total}
+        summary = {"iterations": total.pop("iteration"), **total, **findings.means()}
         summary |= describe_loss(problem.settings, problem.train)
         if problem.loss == "photon":
             summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}

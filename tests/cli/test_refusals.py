@@ -56,7 +56,7 @@ optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none ha
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
 optimize scene.yaml -o out --resume --overwrite => 2 Error: --resume goes on with what --overwrite
 optimize scene.yaml -o out --resume => 2 out/checkpoints/last.pt: there is no checkpoint to resume
-optimize scene.yaml -o full --resume => 2 full: holds notes.txt, which ddrecon did not write
+optimize scene.yaml -o full --resume => 2 full: no ddrecon.manifest says who wrote notes.txt; if dd
 check full => 2 full: holds no result.yaml, as `ddrecon optimize` writes it at its end; name a
 check begun => 2 begun: holds no result.yaml, as `ddrecon optimize` writes it at its end; finish
 check film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003

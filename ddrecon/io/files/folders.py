@@ -97,6 +97,9 @@ class Folder:
         if kind is None and content and not overwrite:
             strange = f"holds {content[0]}, which ddrecon did not write"
             advice = "choose another folder, or say --overwrite, which keeps it"
+            if resume:
+                strange = f"no {MANIFEST} says who wrote {content[0]}"
+                advice = f"if ddrecon did, write a line `ddrecon {self.kind}` into that file"
             raise UsageError(f"{self.path}: {strange}; {advice}")
         if kind not in (None, self.kind):
             raise UsageError(

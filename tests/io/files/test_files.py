@@ -203,7 +203,21 @@ def test_a_folder_of_another_kind_is_refused(tmp_path: Path, there: str, kind: s
 def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text("mine")
     (tmp_path / MANIFEST).write_text("ddrecon strange\nscene.yaml\n")
-    assert_refused(tmp_path, RUN, "holds scene.yaml, which ddrecon did not", {"resume": True}, {})
+    assert_refused(tmp_path, RUN, "holds scene.yaml, which ddrecon did not", {})
+    assert_refused(
+        tmp_path, RUN, "manifest says who wrote scene.yaml; if ddrecon", {"resume": True}
+    )
+
+
+def test_a_folder_whose_manifest_is_lost_goes_on_as_the_refusal_says(tmp_path: Path) -> None:
+    fill(tmp_path, RUN, "a")
+    (tmp_path / MANIFEST).unlink()
+    with pytest.raises(UsageError) as refused, claim_folder(tmp_path, RUN, resume=True):
+        pass
+    (tmp_path / MANIFEST).write_text(str(refused.value).split("`")[1] + "\n")
+    with claim_folder(tmp_path, RUN, resume=True):
+        pass
+    assert (tmp_path / "a").is_file()
 
 
 def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
