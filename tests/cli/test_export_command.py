@@ -155,7 +155,7 @@ def test_a_volume(succeed: Run, suffix: str) -> None:
     box = "from [-1.0, -2.0, -3.0] to [1.0, 1.0, 1.0]"
     assert cells == f"cells: 4 x 3 x 2 (x, y, z) of 0.5 x 1 x 2 u, {box}"
     assert albedo == "albedo: RGB, 0 to 1, mean 0.08333, more than 0.0001 of the largest in 16.7 %"
-    assert not more
+    assert more == ["  metadata: class fog volume"] * (suffix == ".vdb")
 
 
 def test_what_is_no_field_of_the_same_cells_is_named(succeed: Run, refuse: Refuse) -> None:

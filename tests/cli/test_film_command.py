@@ -418,7 +418,10 @@ def test_a_part_done_anew_leaves_all_else(
                 (line,) = refuse(2, *how)
                 assert line.startswith(f"{place}: process ") and "is writing there" in line
     loud = [word for word in optimize("-o", "out", "--resume", "--frames", "1:1") if word != "-q"]
-    assert "stay as they are: 1\n" in run(*loud, "-D", "frames.calibrate=0").stderr
+    assert (
+        "stay as they are: 1 (--frames 1:1 --overwrite "
+        in run(*loud, "-D", "frames.calibrate=0").stderr
+    )
     assert not [*Path("out").rglob("checkpoints/previous.pt")]
 
 
