@@ -38,6 +38,8 @@ PACKAGE = Path(__file__).parents[1]
 _PACKETS = (PACKAGE / "kernels/packets.h").read_text(encoding="utf-8")
 LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
 """Items in a packet on a processor (`packets.h`)."""
+MOST_REGISTERS = 128
+"""Of a thread on a GPU: two blocks of 256 threads then have room beside each other."""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 
 
@@ -85,7 +87,9 @@ class TextKernel:
         @wp.func_native(begin + "".join(variables) + text)
         def do_item(item: int, record: Record): ...
 
-        @wp.kernel(enable_backward=False, module="unique", name=name, module_options=options)
+        own = {"module": "unique", "name": name, "cuda_max_registers": MOST_REGISTERS}
+
+        @wp.kernel(enable_backward=False, module_options=options, **own)
         def do_items(first: int, record: Record):
             do_item(first + wp.tid(), record)
 
