@@ -466,9 +466,13 @@ def info(session: Session, source: Path) -> None:
     _require_volumes(session, [source])
     scene = session.load(source) if _is_scene(source) else None
     from ddrecon.io.info import describe, describe_medium, lines
-    from ddrecon.run.run_folder import fields_to_export
 
-    report = describe_medium(*fields_to_export(scene)) if scene else describe(source)
+    if scene is None:
+        report = describe(source)
+    else:
+        from ddrecon.run.run_folder import fields_to_export
+
+        report = describe_medium(*fields_to_export(scene))
     session.show(report, lines(report))
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.field import EMPTY, Fields, prune
 from ddrecon.io.volumes.table import FORMATS, NANOVDB, read_fields
 
@@ -28,6 +27,8 @@ def describe(path: Path) -> dict[str, Any]:
             report["fields"][name] |= {"unit": field.unit} if field.unit else {}
             report["fields"][name] |= {"labels": field.labels} if field.labels else {}
         return report | ({"no_fields": reasons} if reasons else {})
+    from ddrecon.io.images.table import read_image  # here, as volumes are read without torch
+
     image = read_image(path)
     height, width = image.size
     is_gray = bool((image.pixels == image.pixels[..., :1]).all())

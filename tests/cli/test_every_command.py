@@ -81,6 +81,15 @@ def test_help_and_errors_of_a_scene_file_are_told_at_once(folder: Path) -> None:
     assert done.stdout.splitlines() == [f"{code} True" for code, *_ in CALLS]
 
 
+def test_a_volume_is_described_without_torch(folder: Path) -> None:
+    """Which takes seconds to load."""
+    np.savez("a.npz", density=np.ones((2, 2, 2)))
+    said = "from ddrecon.cli.commands import main; main(['info', 'a.npz'], standalone_mode=False)"
+    code = f"import sys; {said}; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["False"], done.stderr
+
+
 @pytest.mark.parametrize("argument", ["--help", "--version"])
 def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
     command = [sys.executable, "-m", "ddrecon", argument]
