@@ -10,8 +10,6 @@ and double precision, solved as far as rounding allows, lose no light and have n
 zero. The plume, which is measured, is in the same words.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What the medium of a scene chooses where settings leave something out."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -5,8 +5,6 @@ fuses a loop into one kernel of the same formulas, so numbers agree to rounding.
 `numerics.autodiff.is_fused` says where kernels run.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from importlib.util import find_spec

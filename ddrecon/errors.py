@@ -3,8 +3,6 @@
 All are a `DdreconError`; whatever else is raised is a bug and keeps its traceback.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Optional packages, imported where they are needed; of an absent one the extra is named."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from types import ModuleType
 

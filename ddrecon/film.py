@@ -4,8 +4,6 @@ Cameras, exposures and lights do not change in a film: several frames together f
 the calibration, and `shared.json` keeps them.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -4,8 +4,6 @@ A place is left out where a view looks at it and shows nothing (Laurentini 1994,
 doi:10.1109/34.273735). Pictures are used at full resolution, whatever the grid's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

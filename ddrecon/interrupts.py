@@ -4,8 +4,6 @@ An exception in the import of an extension in C crashes it: there the process en
 does where the first Ctrl-C has not ended it yet. Files are replaced whole, so that none is torn.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """The light of a scene: in its volume, to and fro between that and a ground, and along rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

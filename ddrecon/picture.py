@@ -1,7 +1,5 @@
 """Pictures of a scene: rays of a camera collect what its volume sends along them (E2.1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

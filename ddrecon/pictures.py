@@ -1,7 +1,5 @@
 """What pictures are: how they are displayed, how they err, on what scale they are compared."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Progress bars and tables: who asks for long work hands in what shows its progress."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

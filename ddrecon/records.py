@@ -3,8 +3,6 @@
 The metadata of a field hold limits of its numbers, or the `choices` that it is one of.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ The physics and the reconstruction read these records; `ddrecon.scene_file` has 
 in a file.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

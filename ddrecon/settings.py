@@ -4,8 +4,6 @@ The `choices` of a field are the names of a table of implementations. No table i
 scene file is read without torch. `violations` yields what is wrong with several values together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

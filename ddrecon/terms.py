@@ -1,7 +1,5 @@
 """What `check` says of a scene: the physics it needs, and what can hardly be meant in it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

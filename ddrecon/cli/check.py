@@ -1,7 +1,5 @@
 """What `ddrecon check` tells of a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What all commands share: a table of options, a session, how errors and warnings reach users."""
 
-from __future__ import annotations
-
 import functools
 import os
 import re

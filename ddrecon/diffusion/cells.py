@@ -4,8 +4,6 @@ View rays and beams see fields that are linear between cells' centers. Energy is
 light is computed in a medium of cells' means, and what it is there is the mean of what is seen.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ same shape, finite and with finite derivatives at zero density. `CLOSURES` is th
 file chooses from.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ D is kept for the backward pass, which makes conductances and right sides from i
 a time: memory is what limits the size of a volume.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, reduce

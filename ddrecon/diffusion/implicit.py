@@ -9,8 +9,6 @@ An operator knows its transpose and these products with dA; `ImplicitSolve` does
 scheme.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial

@@ -6,8 +6,6 @@ the residual falls below `tolerance` times that of the right side, for every col
 norms are over the diagonal.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any

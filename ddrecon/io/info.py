@@ -1,7 +1,5 @@
 """What a data file holds, in words: a volume's box, cells and fields, or an image's values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path

@@ -4,8 +4,6 @@ Text files (.csv, .txt) have numbers in columns, separated by commas or spaces, 
 names the columns; `#` begins a comment.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

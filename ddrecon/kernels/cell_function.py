@@ -7,8 +7,6 @@ Values, tangents and cotangents are the same code, of plain numbers and of dual 
 `cells.h` goes through the cells. A `RowFunction` may look beyond its cell (`faces.h`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 Whoever launches a kernel names its adjoint as well: another thread compiles it meanwhile.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 import os

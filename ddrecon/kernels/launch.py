@@ -4,8 +4,6 @@ Every kernel takes `first: int` before all else, and thread `wp.tid()` of a laun
 `first + wp.tid()`: so the items of a launch can be shared among threads of a processor.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

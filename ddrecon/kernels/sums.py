@@ -5,8 +5,6 @@ items add in any order: to whole numbers, as `add_to` of `numbers.h` has it. Pro
 matrices, whose rows are items, need neither.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

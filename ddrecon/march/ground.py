@@ -5,8 +5,6 @@ that is asked for. Light of the sky and of the medium is smooth: it is found on 
 rays through all of them at once.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

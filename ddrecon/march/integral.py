@@ -8,8 +8,6 @@ cut at nodes, next to where it leaves a period. Fields go on beyond its faces fo
 do: so it does not matter where a period begins.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping

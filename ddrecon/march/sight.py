@@ -7,8 +7,6 @@ lattice is regular in the plane through the box's center, across the axis along 
 most cells, and so it is in every slice.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a camera sees through the faces of a box that refract light (docs/theory.md E2.14)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """What optics says of flames, droplets and faces: by Planck, Mie and Fresnel."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -15,8 +15,6 @@ number too (E8.9). Of Henyey and Greenstein's function the polynomial is of S ov
 exact without a peak.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from abc import ABC, abstractmethod

@@ -3,8 +3,6 @@
 Every name of torch that is private, or not documented, stands in this file.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator

@@ -12,8 +12,6 @@ and of the mean along it e psi - r eta are its own, with
 Where d is small eta is its series: its closed form is a difference of nearly equal numbers there.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ small. It is found from coarse to fine, since a change is a slope times a motion
 only.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate

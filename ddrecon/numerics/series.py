@@ -10,8 +10,6 @@ take a few products where a closed form takes many; by interpolation at Chebyshe
 doi:10.1137/1.9781611975949).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections import deque

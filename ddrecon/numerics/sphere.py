@@ -14,8 +14,6 @@ which Lebedev's rules lack 11, 8, 1 and 1 percent. It has the means of x^4, x^2 
 those of degree 8 and 10 within 0.4 and 1.3 percent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import permutations, product

@@ -6,8 +6,6 @@ asked of the loaded scene, so that Mitsuba's own defaults count. Volumes are eva
 centers of the cells of `sigma_t`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

@@ -9,8 +9,6 @@ coefficient, so it is handed over on `FINER` times finer cells (in grids of at m
 whose centers little is left of that difference.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

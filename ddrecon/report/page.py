@@ -5,8 +5,6 @@ are lines and texts that the template draws as SVG: matplotlib is an extra and t
 start, and a report is written after every run.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Callable, Mapping, Sequence

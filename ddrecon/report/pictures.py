@@ -3,8 +3,6 @@
 Arrays here are numpy, [h, w, 3].
 """
 
-from __future__ import annotations
-
 import numpy as np
 from torch import Tensor
 from torch.nn.functional import avg_pool2d

@@ -3,8 +3,6 @@
 In a notebook they are shown in a frame of their own.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import math

@@ -5,8 +5,6 @@ the first alone has a folder. In it are two checkpoints, files of tensors and pl
 with a description of what the job's result depends on, so that only the same job goes on from it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

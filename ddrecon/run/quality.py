@@ -5,8 +5,6 @@ out are registered as well: their pose and exposure are fitted to the finished v
 Newton with the slopes of where they were given, by differences: shifts are small.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Rendered views as files: linear pixels, previews, derivative images, movies, a record of all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 Target and render of a view stand side by side as they are displayed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise

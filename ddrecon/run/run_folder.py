@@ -1,7 +1,5 @@
 """The folder a reconstruction writes: log, volumes, pictures, checkpoints, summary and report."""
 
-from __future__ import annotations
-
 import csv
 import warnings
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """Scene files as tensors: the front door `load_scene`; and what a scene gets that it leaves out."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence

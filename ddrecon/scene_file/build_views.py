@@ -1,7 +1,5 @@
 """The views section as cameras and pictures, frame by frame, and the box that fits them."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence

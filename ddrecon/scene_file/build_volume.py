@@ -1,7 +1,5 @@
 """The volume section as tensors: density, cross sections and phase function of each medium."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

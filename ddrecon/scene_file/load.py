@@ -1,7 +1,5 @@
 """Scene files as records, and back: strict YAML; everything that is wrong is reported at once."""
 
-from __future__ import annotations
-
 import glob
 import math
 import os

@@ -7,8 +7,6 @@ keys of which exactly one is given; `violations` yields (key, what is wrong) for
 values at once. Records with a `type` are told apart by it, others by their first required key.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What a scene file may say of views and cameras, as `schema` has the rest of it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ is followed to the middle of each cell at a face. Both are found apart from the 
 light is absorbed: what the sum lacks says how good all three are.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Everything runs in float64 with solves to nearly its precision, for every parame
 all of them at once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math

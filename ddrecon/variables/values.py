@@ -6,8 +6,6 @@
 `.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors lead.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ D of a medium and linear functions of neighbors (E2.9, `cells.h`), the system of
 of E2.5 (`faces.h`), all with derivatives.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ a slice; passes over few cells, and all passes where threads are no more than co
 launch, in which a thread does the cells of a color.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

@@ -3,8 +3,6 @@
 Whatever is written so inside a folder that this process has claimed is noted in its manifest.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -5,8 +5,6 @@ The operating system locks a file that names its holder, and lets go when its pr
 it ends, so what a killed process left behind is only a name.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import warnings

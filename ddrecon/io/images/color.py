@@ -1,7 +1,5 @@
 """What pictures say of their samples: the curve that encodes them, their primaries, their turn."""
 
-from __future__ import annotations
-
 import io
 import re
 import warnings

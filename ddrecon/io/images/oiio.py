@@ -3,8 +3,6 @@
 All but PNG are linear, and multiplied by their alpha: that of EXR is so by convention.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ films) are decoded from sRGB unless they say that they are linear. All are multi
 alpha: a pixel of alpha 0 is empty: black. Previews have exposure 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec

@@ -3,8 +3,6 @@
 Values are `[z, y, x]` or `[z, y, x, 3]`, cell-centered; bounds are in world order (x, y, z).
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping

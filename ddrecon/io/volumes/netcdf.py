@@ -5,8 +5,6 @@ coordinate says (CF conventions), else by its name. Coordinates are centers of c
 in the unit of x, which is taken for the scene's unit of length.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

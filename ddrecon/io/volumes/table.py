@@ -7,8 +7,6 @@ values, little-endian, of one field without a name. The header: `VOL`, version 3
 fastest, then x.
 """
 
-from __future__ import annotations
-
 import struct
 import warnings
 import zipfile

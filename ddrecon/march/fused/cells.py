@@ -6,8 +6,6 @@ and to no derivative that is asked for. A packet of rays has a bit for each segm
 rays and a support that stay.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 It is one differentiable function of tensors.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
