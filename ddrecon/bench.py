@@ -38,7 +38,7 @@ from ddrecon.light_field import receive_in_parts
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import render, render_each
-from ddrecon.progress import Progress, table_lines
+from ddrecon.progress import show_progress, table_lines
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.scene import Scene, View
@@ -139,9 +139,7 @@ def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
     return Shot(image, None, perf_counter() - start, 0.0, samples)
 
 
-def run_bench(
-    scene: Scene, double: Scene, tracer: Tracer | None, is_quick: bool, progress: Progress
-) -> dict[str, Any]:
+def run_bench(scene: Scene, double: Scene, tracer: Tracer | None, is_quick: bool) -> dict[str, Any]:
     """What every variant of `scene` and path tracing take and miss, as plain values.
 
     `double` is `scene` in double precision; without `tracer` there is no path tracing. Of the
@@ -154,7 +152,7 @@ def run_bench(
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
     }
     exact, solved = dict[str, Shot](), dict[tuple[object, ...], Shot]()
-    for name, variant in progress([*variants_of(double, is_quick).items()], "exact solutions"):
+    for name, variant in show_progress([*variants_of(double, is_quick).items()], "exact solutions"):
         marching = replace(
             variant.render, steps_per_voxel=max(3, variant.render.steps), tolerance=0.0
         )
@@ -171,7 +169,7 @@ def run_bench(
         truth = Traced.of([trace(tracer, paths[-1], seed).image.numpy() for seed in seeds])
         for samples in paths:
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
-    shots = measure(contestants, 1 if is_quick else TURNS, progress)
+    shots = measure(contestants, 1 if is_quick else TURNS)
     rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
     mark_best(rows, 0.0 if truth is None else truth.noise)
     height, width = scene.views[0].camera.size
@@ -182,9 +180,7 @@ def run_bench(
     }
 
 
-def measure(
-    contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress
-) -> dict[str, list[Shot]]:
+def measure(contestants: Mapping[str, Callable[[], Shot]], turns: int) -> dict[str, list[Shot]]:
     """The shots by name of all `contestants` that can be solved.
 
     All run once in every turn, so that other work on the machine slows all alike. The first turn,
@@ -192,7 +188,7 @@ def measure(
     """
     shots: dict[str, list[Shot]] = {name: [] for name in contestants}
     schedule = [(turn, name) for turn in range(turns + 1) for name in contestants]
-    for turn, name in progress(schedule, "bench"):
+    for turn, name in show_progress(schedule, "bench"):
         if turn == len(shots[name]):
             with suppress(SolveError):
                 shots[name].append(contestants[name]())
@@ -399,9 +395,11 @@ def find_failures(numbers: Mapping[str, float]) -> list[str]:
     return [name for name, is_kept in bounds.items() if not is_kept]
 
 
-def run_cases(device: torch.device, progress: Progress) -> dict[str, Any]:
+def run_cases(device: torch.device) -> dict[str, Any]:
     """The report of every case of `CASES`, and whether all have passed."""
-    cases = {name: run_case(CASES[name], device) for name in progress(list(CASES), "hard cases")}
+    cases = {
+        name: run_case(CASES[name], device) for name in show_progress(list(CASES), "hard cases")
+    }
     return {"passed": not any(case["failures"] for case in cases.values()), "cases": cases}
 
 

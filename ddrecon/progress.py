@@ -1,17 +1,13 @@
-"""Progress bars and tables: who asks for long work hands in what shows its progress."""
+"""Progress bars and tables."""
 
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import Timer
 from typing import Any
 
 from tqdm import tqdm
-
-Progress = Callable[[Sequence[Any], str], Iterable[Any]]
-"""`progress(items, text)` yields the `items` one by one, beside a bar of this `text`."""
-
 
 IN_A_LOG = 30.0
 """Seconds between two states of a bar in a file, each of which is a line there."""

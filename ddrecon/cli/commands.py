@@ -304,7 +304,7 @@ def gradcheck(session: Session, source: Path, parameters: tuple[str, ...], sampl
     scene = session.load(source)
     from ddrecon.validate.gradcheck import check_parameters, lines
 
-    report = check_parameters(scene, parameters, samples, session.seed, session.progress)
+    report = check_parameters(scene, parameters, samples, session.seed)
     session.show(report, lines(report))
     if not report["passed"]:
         sys.exit(1)
@@ -330,8 +330,7 @@ def reference(
     with claim_folder(output, REFERENCE, overwrite=session.overwrite) as folder:
         folder.clear([source, *referenced_files(scene_file)])
         compared = None if is_only_traced else scene
-        settings = output, paths, session.seed, session.progress
-        report = compare_to_folder(tracer, compared, views, *settings)
+        report = compare_to_folder(tracer, compared, views, output, paths, session.seed)
         report["environment"] = session.environment() | {"mitsuba": tracer.module.__version__}
         write_json(output / "reference.json", report)
     session.show(report, reference_lines(report))
@@ -355,7 +354,7 @@ def bench(session: Session, source: Path | None, is_quick: bool, is_hard: bool) 
         if is_hard:
             from ddrecon.bench import hard_lines, run_cases
 
-            report = run_cases(session.start(), session.progress)
+            report = run_cases(session.start())
             lines = hard_lines(report)
         else:
             load = None if scene_file is None else partial(session.build, scene_file)
@@ -382,7 +381,7 @@ def _bench_speed(
         tracer = open_tracer(scene, scene.views, threads=session.threads)
     except (MissingExtraError, SceneError) as error:
         click.echo(f"without path tracing: {error}", err=True)
-    report = run_bench(scene, double, tracer, is_quick, session.progress)
+    report = run_bench(scene, double, tracer, is_quick)
     return report | {"environment": session.environment()}, bench_lines(report)
 
 

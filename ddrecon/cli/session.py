@@ -23,7 +23,7 @@ from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder, claim_folder
-from ddrecon.progress import be_quiet, show_progress
+from ddrecon.progress import be_quiet
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT, require_no_film
 from ddrecon.scene_file.load import SceneFile, read_scene
@@ -147,8 +147,6 @@ class Session:
     def load(self, path: Path) -> Scene:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))
-
-    progress = staticmethod(show_progress)
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""

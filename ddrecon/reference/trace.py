@@ -26,7 +26,7 @@ from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.phase import Blend, PhaseFunction, TwoLobe
 from ddrecon.picture import view_image
-from ddrecon.progress import Progress
+from ddrecon.progress import show_progress
 from ddrecon.reference.mitsuba_scene import LONGEST, is_gray, mitsuba_scene, sensor_id
 from ddrecon.report.pictures import comparison, diverging, pixels
 from ddrecon.scene import Scene, View
@@ -198,14 +198,12 @@ def compare_to_folder(
     folder: Path,
     samples: int,
     seed: int,
-    progress: Progress,
 ) -> dict[str, Any]:
     """Writes traced and our own images of `views` of `scene`, and returns a report with our errors.
 
     They are NAME.reference.*, NAME.ours.*, NAME.difference.* (ours less the reference) and
     NAME.comparison.png in `folder`; without `scene` the traced ones alone, NAME.*. `tracer` must be
-    of these views, and each is traced with `samples` >= 2 paths a pixel; `progress` is told of the
-    passes of each view.
+    of these views, and each is traced with `samples` >= 2 paths a pixel.
     """
     passes = min(PASSES, samples)
     samples_per_pass = -(-samples // passes)
@@ -228,7 +226,7 @@ def compare_to_folder(
     for index, view in enumerate(views):
         start = perf_counter()
         seeds = [(seed * passes + number) % SEEDS for number in range(passes)]
-        pass_seeds = progress(seeds, view.name)
+        pass_seeds = show_progress(seeds, view.name)
         traced = Traced.of([tracer.trace(index, number, samples_per_pass) for number in pass_seeds])
         seconds = {"reference": perf_counter() - start}
         measured: dict[str, Any] = {"noise": traced.noise, "seconds": seconds}

@@ -21,7 +21,7 @@ from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.picture import view_picture
-from ddrecon.progress import Progress, table_lines
+from ddrecon.progress import show_progress, table_lines
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import SHORT_STEPS, is_of_volume, kind_of
 from ddrecon.variables.values import (
@@ -63,7 +63,7 @@ def lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def check_parameters(
-    scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Progress
+    scene: Scene, names: tuple[str, ...], samples: int, seed: int
 ) -> dict[str, Any]:
     """The `checks` of the parameters `names` of `scene` (float64), and of all of them at once.
 
@@ -89,7 +89,7 @@ def check_parameters(
     values = {name: (point[name], bar) for name, bar in zip(names, bars, strict=True)}
     checks = [
         _check(name, loss, {name: values[name]}, samples, generator)
-        for name in progress(names, "gradcheck")
+        for name in show_progress(names, "gradcheck")
     ]
     if len(names) > 1:
         checks.append(_check(TOGETHER, loss, values, 0, generator))
