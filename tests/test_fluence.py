@@ -71,7 +71,7 @@ def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face() -
     for light, power in ((DOWN, 0.9 * DOWN.irradiance), (PENCIL, tensor(2.0, 2.0, 2.0))):
         record = find_balance(lit_by(light, density, **BLACK))
         entered, absorbed = tensor(*record["enters"]["lights.0"]), tensor(*record["absorbed"])
-        by_face = {face: tensor(*part["unscattered"]) for face, part in record["leaves"].items()}
+        by_face = {face: tensor(*power) for face, power in record["leaves"].items()}
         torch.testing.assert_close(entered, power, rtol=1e-7, atol=0)
         torch.testing.assert_close(absorbed, entered - by_face.pop("-y"), rtol=1e-7, atol=0)
         assert not torch.stack([*by_face.values()]).any()

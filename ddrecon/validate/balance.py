@@ -1,6 +1,6 @@
 """The energy balance of a scene: what enters its box, what is absorbed there, what leaves (E5.7).
 
-Scattered light leaves as one more sweep has it, in which nothing is lost; light not yet scattered
+Scattered light leaves as one more sweep has it, in which nothing is lost; what passes unscattered
 is followed to the middle of each cell at a face. Both are found apart from the fluence, by which
 light is absorbed: what the sum lacks says how good all three are.
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.grid import Grid, array_order
+from ddrecon.grid import array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import add, cut, fill, weigh
@@ -26,10 +26,10 @@ from ddrecon.light.pairs import ReversedBeam
 from ddrecon.light.profile import enter_faces
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source, decompose_lights
-from ddrecon.light_field import fluence_of, multiply_scatters
+from ddrecon.light_field import LightField, fluence_of, multiply_scatters
 from ddrecon.lighting import solve_light
 from ddrecon.march.ground import Beamed, LitGround, shine_on, transmittance
-from ddrecon.medium.coefficients import Medium, keep_medium, refine_medium, remaining_moments
+from ddrecon.medium.coefficients import Medium, remaining_moments
 from ddrecon.medium.optics import reflectance, transmitted_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene
@@ -49,7 +49,7 @@ RAY_BY_RAY = RenderSettings(tolerance=0.0)
 @torch.no_grad()
 def find_balance(scene: Scene) -> dict[str, Any]:
     """The power that `enters` the box of `scene` by each light, is `absorbed` there, and `leaves`
-    by each face, as unscattered and as scattered light.
+    by each face.
 
     What a ground sends up and what the medium emits enters as well; `into_ground` is what of all
     that leaves falls on the ground. Where faces refract light, what is `reflected` by them from
@@ -59,42 +59,37 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     Raises UsageError where no light enters, or where nobody follows light that is scattered.
     """
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
-    medium, lit, received = light_field.medium, light_field.ground, light_field.received.source
+    medium, lit = light_field.medium, light_field.ground
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
-    # Of light that a forward peak has scattered the light field says that it was not (E8.4).
-    as_it_is = refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)
-    box = _Box((medium, as_it_is), DIRECTIONS[settings.angles], lit)
-    crossings = box.cross_each(scene)
+    lights = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
+    ambient = ambient_radiance([*chain(*lights.values())], medium.g)
+    box, cells, cell = _Box(medium, lit), average_cells(medium), math.prod(medium.grid.spacing)
+    crossings = {name: box.cross(sources) for name, sources in lights.items()}
+    if lit:
+        crossings["ground"] = box.cross_upwards(ambient.flatten())
     enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
+    if cells.emission is not None:
+        enters["emission"] = 4 * math.pi * cell * cells.emission.double().sum((1, 2, 3))
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    _, reflected, passing, unscattered = reduce(torch.add, crossings.values())
-    # Light that scatters leaves as one more sweep has it.
-    source = add(weigh(light_field.diffuse, remaining_moments(medium)), received)
-    rise = steep_gradient(
-        average_cells(medium), light_field.diffuse[0] + received[0], box.directions
-    )
-    scattered = box.sweep_out(medium, source, rise, light=light_field.diffuse)
-    scattered = scattered + passing - unscattered
-    for beam in light_field.turned:
-        scattered = scattered + _leave_turned(beam, medium.grid, box.up)
-    lost = average_cells(medium).absorption.value * fluence_of(light_field, settings)
+    swept = _sweep_out(light_field, DIRECTIONS[settings.angles], medium.index**2 * ambient, box.up)
+    _, reflected, left = reduce(torch.add, crossings.values(), box.nothing)
+    left = reduce(torch.add, (_leave_turned(b, box) for b in light_field.turned), left + swept)
+    lost = cells.absorption.value * fluence_of(light_field, settings)
     powers: dict[str, Any] = {"enters": enters}
     if medium.index != 1:
         powers["reflected"] = reflected.sum((0, 1))
-    powers["absorbed"] = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
-    faces = zip(FACES, unscattered.sum(0), scattered.sum(0), strict=True)
+    powers["absorbed"] = cell * lost.sum((1, 2, 3), dtype=torch.float64)
     powers["leaves"] = {
-        face: {"unscattered": straight, "scattered": turned}
-        for face, straight, turned in faces
+        face: power
+        for face, power in zip(FACES, left.sum(0), strict=True)
         if "zyx".index(face[1]) not in medium.grid.periodic
     }
     if lit:
-        powers["into_ground"] = (unscattered + scattered)[0].sum(0)
+        powers["into_ground"] = left[0].sum(0)
     entered = reduce(torch.add, enters.values())
-    left = powers["absorbed"] + (reflected + unscattered + scattered).sum((0, 1))
-    defect = 100 * (1 - left / entered)
+    defect = 100 * (1 - (powers["absorbed"] + (reflected + left).sum((0, 1))) / entered)
     return {
         **_plain(powers, torch.ones_like(entered)),
         "fractions": _plain(powers, entered),
@@ -112,15 +107,14 @@ def _plain(value: Any, unit: Tensor) -> Any:
 
 @dataclass(frozen=True)
 class _Box:
-    """A box with the medium as light is followed in it, and as it is, over the ground `lit`.
+    """A box with its `medium`, over the ground `lit`.
 
     Power leaves by each of `FACES`, downwards and upwards, [2, 6, C]. Of what crosses the box it is
-    what would leave if that were empty, what faces reflect outside, and what leaves unscattered in
-    each of the `media`, [4, 2, 6, C]. Sweeps have so many `directions`.
+    what would leave if that were empty, what faces reflect outside, and what passes unscattered,
+    [3, 2, 6, C]. Ambient light passes whole: what the medium takes of it sweeps find.
     """
 
-    media: tuple[Medium, Medium]
-    directions: int
+    medium: Medium
     lit: LitGround | None
 
     @property
@@ -131,26 +125,19 @@ class _Box:
     @property
     def areas(self) -> list[float]:
         """Areas of the faces across each axis; 0 along a period, which has none."""
-        grid = self.media[0].grid
+        grid = self.medium.grid
         sides = enumerate(grid.extent)
         return [(axis not in grid.periodic) * math.prod(grid.extent) / side for axis, side in sides]
 
-    def cross_each(self, scene: Scene) -> dict[str, Tensor]:
-        """What crosses of each light of `scene`, of its ground and of its emission."""
-        lights = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
-        crossings = {name: self._cross(sources) for name, sources in lights.items()}
-        if self.lit:
-            ambient = ambient_radiance([*chain(*lights.values())], self.media[0].g).flatten()
-            crossings["ground"] = self._cross_upwards(ambient)
-        if self.media[0].emission is not None:
-            crossings["emission"] = self._cross_out()
-        return crossings
+    @property
+    def nothing(self) -> Tensor:
+        """What crosses where no light shines."""
+        return self.medium.g.new_zeros(3, 2, len(FACES), 1, dtype=torch.float64)
 
-    def _cross(self, sources: Sequence[Source]) -> Tensor:
+    def cross(self, sources: Sequence[Source]) -> Tensor:
         """What crosses of the `sources` of a light that the ground does not hide."""
-        sources = stay_above(sources, self.lit.ground.plane) if self.lit else sources
-        crossing = self.media[0].g.new_zeros(4, 2, len(FACES), 1, dtype=torch.float64)
-        for source in sources:
+        crossing = self.nothing
+        for source in stay_above(sources, self.lit.ground.plane) if self.lit else sources:
             if isinstance(source, AmbientLight):
                 crossing = crossing + self._cross_evenly(source.radiance, (True, self.lit is None))
             elif isinstance(source, Sky):
@@ -161,7 +148,7 @@ class _Box:
                 crossing = crossing + self._follow(source)
         return crossing
 
-    def _cross_upwards(self, ambient: Tensor) -> Tensor:
+    def cross_upwards(self, ambient: Tensor) -> Tensor:
         """What crosses of the ground's light: `ambient` light [C], and what that sends more."""
         crossing = self._cross_evenly(ambient, (False, True))
         for direction, angle in zip(*hemisphere(self.up, UPWARDS, 1.0), strict=True):
@@ -169,30 +156,14 @@ class _Box:
             crossing = crossing + self._follow(light, ambient)
         return crossing
 
-    def _cross_out(self) -> Tensor:
-        """What crosses of emission; in an empty box it would leave, no matter where."""
-        medium = self.media[0]
-        emission = average_cells(medium).emitting.remaining.value
-        power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
-        empty = power / (2 * len(FACES))
-        even = torch.ones_like(medium.extinction.value)
-        leaving = (self.sweep_out(medium.emitting, even[None]) for medium in self.media)
-        return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *leaving))
-
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
         """What crosses of a `radiance` [C] that is the same everywhere: `sides` are down and up."""
-        nothing = self.media[0].extinction.value * 0
-        halves = torch.full((2, len(FACES)), 0.5)
+        halves, index = torch.full((2, len(FACES)), 0.5), self.medium.index
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
         falling = math.pi * (halves * areas)[..., None].to(radiance.device) * radiance
-        index = self.media[0].index
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
-        inflow = index**2 * radiance.view(-1, 1, 1, 1)
-        leaving = (
-            empty + self.sweep_out(medium, nothing[None], None, inflow) for medium in self.media
-        )
-        crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *leaving))
+        crossing = torch.stack([empty, falling - empty, empty])
         return crossing * crossing.new_tensor(sides).view(2, 1, 1)
 
     def _follow(self, light: Beamed, ambient: Tensor | None = None, turns: int = TURNS) -> Tensor:
@@ -201,9 +172,9 @@ class _Box:
         With `ambient` it is that times what the ground sends more than this radiance [C]. `turns`:
         how often it is followed on where faces reflect it inside.
         """
-        if self.media[0].index != 1:
+        if self.medium.index != 1:
             return self._follow_refracted(light, turns)
-        grid, field, powers = self.media[0].grid, self.media[0].extinction.field, list[Tensor]()
+        grid, field, powers = self.medium.grid, self.medium.extinction.field, list[Tensor]()
         for axis, side in product(range(3), range(2)):
             lines, size = grid.centers(field), list(grid.spacing)
             lines[axis] = field.new_full((1, 1, 1), (grid.lower, grid.upper)[side][axis])
@@ -217,18 +188,17 @@ class _Box:
                 irradiance = irradiance * ((even - ambient)[:, None] + more)
             out = self.areas[axis] / len(points) * (2 * side - 1)
             power = irradiance * (out * travel[:, axis]).clamp(min=0)
-            passing = [power, power]
+            passing = power
             if bool(power.any()):
-                passing = [power * transmittance(m, rays, RAY_BY_RAY) for m in self.media]
-            leaving = torch.stack(torch.broadcast_tensors(power, 0 * power, *passing)).double()
-            is_up = travel[:, self.up] > 0
-            powers.append(torch.stack([(leaving * ~is_up).sum(2), (leaving * is_up).sum(2)], 1))
+                passing = power * transmittance(self.medium, rays, RAY_BY_RAY)
+            leaving = torch.stack(torch.broadcast_tensors(power, 0 * power, passing)).double()
+            powers.append(_split(leaving, travel[:, self.up]).sum(-1))
         return torch.stack(torch.broadcast_tensors(*powers), 2)
 
     def _follow_refracted(self, light: Beamed, turns: int) -> Tensor:
         """What crosses of a beam that faces refract, and reflect inside so often."""
         assert not isinstance(light, PointLight)
-        powers, (medium, _) = list[Tensor](), self.media
+        powers, medium = list[Tensor](), self.medium
         for beam in enter_faces(medium.grid, medium.index, light):
             assert beam.face is not None and beam.at_face is not None
             cosine = array_order(beam.light.direction)[beam.face].abs()
@@ -237,76 +207,72 @@ class _Box:
             entering = (area * beam.light.irradiance).expand(len(FACES), -1) / len(FACES)
             outer = reflectance(cosine, medium.index)
             # Of light that only grazes a face nothing enters.
-            crossing = [entering, outer / (1 - outer).clamp(min=1e-9) * entering]
-            for inside in self.media:
-                passages = follow_inside(inside, beam, turns)
-                crossing.append(reduce(torch.add, (passage.released for passage in passages)))
-            powers.append(torch.stack(torch.broadcast_tensors(*crossing)).double())
+            outside = outer / (1 - outer).clamp(min=1e-9) * entering
+            passages = follow_inside(medium, beam, turns)
+            released = reduce(torch.add, (passage.released for passage in passages))
+            crossing = torch.broadcast_tensors(entering, outside, released)
+            powers.append(torch.stack(crossing).double())
         power = reduce(torch.add, powers)
         return torch.stack([power, 0 * power], 1)
 
-    def sweep_out(
-        self,
-        medium: Medium,
-        source: Tensor,
-        gradient: Tensor | None = None,
-        inflow: Tensor | None = None,
-        light: Tensor | None = None,
-    ) -> Tensor:
-        """The power that leaves in one sweep of light that `source` phi scatters in `medium`.
 
-        `gradient` is `steep_gradient` of what scatters, None for zero. With `inflow` it is less
-        what that would be in an empty box. Light that faces reflect inside is swept until it has
-        come to rest, from `light` on, None for none.
-        """
-        grid, cells = medium.grid, average_cells(medium)
-        extinction, moments = cells.extinction.value, fill(source, medium.degree)
-        moments = emitted_light(cells, cut(moments), inflow)
-        gradient = torch.zeros_like(moments[:1]) if gradient is None else gradient
-        courses, weights, values = sweep_rule(self.directions, len(moments))
-        mirror, rows = face_mirror(medium, self.directions), values.to(moments)
-        begun = 0 * moments if light is None else fill(light, medium.degree)
-        for sweep in range(1 if mirror is None else SWEEPS):
+def _sweep_out(light_field: LightField, directions: int, inflow: Tensor, up: int) -> Tensor:
+    """The power that leaves in one sweep of what scatters and is emitted, less `inflow`.
+
+    Light that faces reflect inside is swept until it has come to rest.
+    """
+    medium, received = light_field.medium, light_field.received.source
+    grid, cells = medium.grid, average_cells(medium)
+    source = fill(
+        add(weigh(light_field.diffuse, remaining_moments(medium)), received), medium.degree
+    )
+    moments = emitted_light(cells, cut(source), inflow)
+    if cells.emission is not None:
+        moments = add(moments, cells.emission[None])
+    gradient = steep_gradient(cells, light_field.diffuse[0] + received[0], directions)
+    courses, weights, values = sweep_rule(directions, len(moments))
+    mirror, rows = face_mirror(medium, directions), values.to(moments)
+    for sweep in range(1 if mirror is None else SWEEPS):
+        if mirror is not None:
+            mirror.begin(None if sweep else fill(light_field.diffuse, medium.degree))
+        power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
+        for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
+            emitted = torch.tensordot(rows[number], moments, 1)
+            ends = None if mirror is None else mirror.entering(number)
+            rise = gradient.expand(3, *emitted.shape)
+            _, out = radiance_along(grid, cells.extinction.value, emitted, rise, direction, ends)
             if mirror is not None:
-                mirror.begin(begun if sweep == 0 else None)
-            power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
-            for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
-                emitted = torch.tensordot(rows[number], moments, 1)
-                ends = None if mirror is None else mirror.entering(number)
-                fields = extinction, emitted, gradient.expand(3, *emitted.shape)
-                _, out = radiance_along(grid, *fields, direction, ends)
-                if mirror is not None:
-                    mirror.left.append(out)
-                    out = mirror.released(number)
-                gone = power.new_zeros(len(FACES), out[0].shape[-3])
-                course = Characteristic.of(grid, direction)
-                scale = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
-                for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
-                    moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
-                    if moved and axis not in grid.periodic:
-                        lost = layer.sum(across, dtype=torch.float64)
-                        gone[2 * axis + (moved > 0)] = scale * abs(moved) * lost
-                power = power + _split(gone, direction[self.up])
-        return power
+                mirror.left.append(out)
+                out = mirror.released(number)
+            gone = power.new_zeros(len(FACES), out[0].shape[-3])
+            course = Characteristic.of(grid, direction)
+            scale = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
+            for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
+                moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
+                if moved and axis not in grid.periodic:
+                    lost = layer.sum(across, dtype=torch.float64)
+                    gone[2 * axis + (moved > 0)] = scale * abs(moved) * lost
+            power = power + _split(gone, direction[up])
+    return power
 
 
-def _leave_turned(beam: ReversedBeam, grid: Grid, up: int) -> Tensor:
+def _leave_turned(beam: ReversedBeam, box: _Box) -> Tensor:
     """The power of a turned `beam` (E8.11), at faces the line through two cells."""
     power = beam.radiance.new_zeros(len(FACES), len(beam.radiance), dtype=torch.float64)
     for axis, along in enumerate(beam.direction.tolist()):
         layers = beam.radiance.unbind(1 + axis)[:: -1 if along > 0 else 1]
         last, before = layers[0], layers[min(1, len(layers) - 1)]
-        area = 4 * math.pi * abs(along) * math.prod(grid.spacing) / grid.spacing[axis]
-        if axis not in grid.periodic:
-            end = (1.5 * last - 0.5 * before).clamp(min=0)
-            power[2 * axis + (along > 0)] = area * end.sum((1, 2))
-    return _split(power, float(beam.direction[up]))
+        end, cells = (1.5 * last - 0.5 * before).clamp(min=0), last[0].numel()
+        power[2 * axis + (along > 0)] = (
+            4 * math.pi * abs(along) * box.areas[axis] / cells * end.sum((1, 2))
+        )
+    return _split(power, beam.direction[box.up])
 
 
-def _split(power: Tensor, rise: float) -> Tensor:
+def _split(power: Tensor, rise: Tensor | float) -> Tensor:
     """`power` of light that rises so much, downwards and upwards; of level light half each."""
-    share = (1 + (rise > 0) - (rise < 0)) / 2
-    return torch.stack([(1 - share) * power, share * power])
+    share = (1 + torch.as_tensor(rise).sign()) / 2
+    return torch.stack([(1 - share) * power, share * power], -3)
 
 
 def lines(report: dict[str, Any]) -> list[str]:
@@ -321,8 +287,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         texts.append(f"reflected from outside: {text(shares['reflected'], '.2%')}")
     texts.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(shares['absorbed'], '.2%')})")
     for face, leaving in shares["leaves"].items():
-        straight, scattered = (text(leaving[key], ".2%") for key in ("unscattered", "scattered"))
-        texts.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
+        texts.append(f"leaves by {face}: {text(leaving, '.2%')}")
     if "into_ground" in shares:
         texts.append(f"into the ground: {text(shares['into_ground'], '.2%')}")
     return [*texts, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]

@@ -107,8 +107,8 @@ class Layer:
         camera = _camera([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], 1e-3, 1)
         with loaded(_scene(self.volume, self.sun, [camera])) as scene:
             parts = find_balance(scene)["fractions"]
-        by_face = {face: sum(part.values()) for face, part in parts["leaves"].items()}
-        return {"R": by_face["+z"], "T": by_face["-z"], "A": parts["absorbed"]}
+        leaves = parts["leaves"]
+        return {"R": leaves["+z"], "T": leaves["-z"], "A": parts["absorbed"]}
 
     def seen(self, overrides: Sequence[str] = ()) -> Seen:
         """What ddrecon makes of it."""
