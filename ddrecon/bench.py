@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ from ddrecon.light.sky import decompose_lights
 from ddrecon.light_field import receive_in_parts
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
-from ddrecon.picture import render, render_each
+from ddrecon.picture import render_each
 from ddrecon.progress import show_progress, table_lines
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text
@@ -60,11 +60,11 @@ SPEED_COLUMNS |= {"image_error": "", "best": ""}
 @dataclass(frozen=True)
 class Shot:
     """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean by
-    density, None of path tracing. `iterations` are the first solve's, or samples a pixel.
+    density, empty of path tracing. `iterations` are the first solve's, or samples a pixel.
     """
 
     image: Tensor
-    gradient: Tensor | None
+    gradient: Tensor
     image_seconds: float
     gradient_seconds: float
     iterations: int
@@ -119,10 +119,13 @@ def _settings(scene: Scene) -> tuple[object, ...]:
     return scene.volume.grid.shape, scene.render, diffusion
 
 
-def shoot(scene: Scene) -> Shot:
-    """An image of the first view of `scene`, rendered from nothing, with its gradient."""
+def shoot(scene: Scene, memory: SolveMemory | None = None) -> Shot:
+    """An image of the first view of `scene`, rendered from nothing, with its gradient.
+
+    Solutions stay in an empty `memory`.
+    """
     density = scene.volume.density.detach().clone().requires_grad_()
-    varied, memory = with_values(scene, {"density": density}), SolveMemory()
+    varied, memory = with_values(scene, {"density": density}), memory or SolveMemory()
     start = _now(density)
     image = render_each(varied, varied.views[:1], memory)[0]
     middle = _now(density)
@@ -136,7 +139,7 @@ def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
     """An image by so many paths a pixel."""
     start = perf_counter()
     image = torch.from_numpy(tracer.trace(0, seed, samples)).movedim(-1, 0)
-    return Shot(image, None, perf_counter() - start, 0.0, samples)
+    return Shot(image, image[:0], perf_counter() - start, 0.0, samples)
 
 
 def run_bench(scene: Scene, double: Scene, tracer: Tracer | None, is_quick: bool) -> dict[str, Any]:
@@ -200,7 +203,7 @@ def row_of(
 ) -> dict[str, Any]:
     """The row of what took these `shots`; errors are None where nothing is to compare with."""
     shot, errors = shots[0], dict.fromkeys(("image_numerical", "gradient_numerical"))
-    if exact is not None and exact.gradient is not None and shot.gradient is not None:
+    if exact is not None:
         errors["image_numerical"] = relative_error(shot.image, exact.image)
         errors["gradient_numerical"] = relative_error(shot.gradient, exact.gradient)
     return {
@@ -370,6 +373,9 @@ NUMBERS += ("lowest", "energy", "energy_double", "depth")
 
 Errors are relative RMS, absolute where nothing is; `lowest` is a part of the brightest pixel.
 """
+NO_LIGHT = {"residual": 0.0, "attainable": 0.0, "energy": 0.0}
+"""The balance of a solution without a source."""
+SMALLEST = torch.finfo(torch.float32).tiny
 HARD_COLUMNS = {"case": "", **dict.fromkeys(NUMBERS, ".2g"), "verdict": ""}
 SINGLE_FROM_DOUBLE = 1e-4
 """Errors of images, and of gradients, in float32 against float64."""
@@ -407,19 +413,23 @@ def run_case(case: HardCase, device: torch.device) -> dict[str, Any]:
     """The numbers of `case`, rendered in both precisions, and its `failures`; these alone where a
     solve gives up.
     """
+    scenes = [case.scene(dtype, device) for dtype in TOLERANCE]
+    memories = [SolveMemory() for _ in scenes]
     try:
-        (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
-            _render(case, dtype, device) for dtype in TOLERANCE
-        )
+        shot, exact = map(shoot, scenes, memories)
     except SolveError as error:
         return {"failures": [str(error)]}
-    numbers: dict[str, float] = {
-        **balance._asdict(),
-        "iterations": iterations,
-        "image_error": relative_error(image, exact),
-        "gradient_error": relative_error(gradient, exact_gradient),
-        "lowest": float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
-        "energy_double": exact_balance.energy,
+    balance, balance_double = (
+        balance_of(scene, memory.last["forward", 0]) if memory.records else NO_LIGHT
+        for scene, memory in zip(scenes, memories, strict=True)
+    )
+    numbers = {
+        **balance,
+        "iterations": sum(r.iterations for r in memories[0].records if r.kind != "rounds"),
+        "image_error": relative_error(shot.image, exact.image),
+        "gradient_error": relative_error(shot.gradient, exact.gradient),
+        "lowest": float(shot.image.min() / shot.image.max().clamp(min=SMALLEST)),
+        "energy_double": balance_double["energy"],
         "depth": case.depth * max(case.shape),
     }
     return {**numbers, "failures": find_failures(numbers)}
@@ -435,41 +445,19 @@ def hard_lines(report: Mapping[str, Any]) -> list[str]:
     return [*table_lines(HARD_COLUMNS, rows), f"{len(rows)} cases, {failed} failed"]
 
 
-class Balance(NamedTuple):
-    """How far a solution is from balance (E2.4, E2.6, E2.7); all are 0 where there is no source.
-
-    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by, of b - A u
-    itself, which iterations update rather than compute; `attainable`: what rounding u makes of it;
-    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
-    """
-
-    residual: float = 0.0
-    attainable: float = 0.0
-    energy: float = 0.0
-
-
-def _render(
-    case: HardCase, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, int, Balance]:
-    """The image [3, h, w], the gradient of its mean by density [z, y, x], iterations, balance."""
-    scene, memory = case.scene(dtype, device), SolveMemory()
-    density = scene.volume.density.requires_grad_()
-    image = render(scene, memory=memory)[0]
-    (gradient,) = torch.autograd.grad(image.mean(), density)
-    density.requires_grad_(False)
-    balance = balance_of(scene, memory.last["forward", 0]) if memory.records else Balance()
-    iterations = sum(r.iterations for r in memory.records if r.kind != "rounds")
-    return image.detach(), gradient, iterations, balance
-
-
 def relative_error(rounded: Tensor, exact: Tensor) -> float:
     """The relative RMS error of `rounded`, absolute where `exact`, of float64, is zero."""
     size = exact.norm()
     return float((rounded.double() - exact).norm() / torch.where(size > 0, size, 1))
 
 
-def balance_of(scene: Scene, solution: Tensor) -> Balance:
-    """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
+def balance_of(scene: Scene, solution: Tensor) -> dict[str, float]:
+    """How far `solution`, L0 [C, z, y, x], is from balance in `scene` (E2.4, E2.6, E2.7).
+
+    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by, of b - A u
+    itself, which iterations update rather than compute; `attainable`: what rounding u makes of it;
+    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
+    """
     grid, settings = scene.volume.grid, scene.diffusion
     medium = scale_medium(scene.volume, settings.angles)
     cells, lights = average_cells(medium), decompose_lights(scene.lights)
@@ -479,7 +467,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     problem = DiffusionProblem(cells, closure, source, outside, cells.degree > 0)
     operator, right = problem.system
     if not right.any():
-        return Balance()
+        return NO_LIGHT
     escape = boundary_loss(problem.diffusion, grid)
     injected = cells.remaining_scattering * problem.source[0] + escape * problem.outside
     # b sums to what is injected less what Q1 drives out of the box; between cells Q1 only moves.
@@ -490,7 +478,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     residual = float((scale * (right - operator.apply(solution))).norm() / size)
     # What rounding every entry of the solution by one unit in the last adds to it.
     rounding = torch.finfo(solution.dtype).eps * (scale * operator.diagonal * solution).norm()
-    return Balance(residual, float(rounding / size), energy)
+    return {"residual": residual, "attainable": float(rounding / size), "energy": energy}
 
 
 def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.device) -> Scene:
