@@ -12,8 +12,7 @@ doi:10.1137/1.9781611975949).
 
 import functools
 import math
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,16 +50,11 @@ def legendre_at_even_angles(steps: int, count: int) -> tuple[Tensor, Tensor]:
 
 def legendre(cosine: Tensor, count: int) -> Tensor:
     """P_l(`cosine`) for l < `count`, as a new last axis."""
-    return torch.stack([*_each_legendre(cosine, count)], -1)
-
-
-def _each_legendre(cosine: Tensor, count: int) -> Iterator[Tensor]:
-    """P_l(`cosine`) for l < `count`, one at a time."""
-    before, value = torch.zeros_like(cosine), torch.ones_like(cosine)
-    for degree in range(count):
-        yield value
-        after = ((2 * degree + 1) * cosine * value - degree * before) / (degree + 1)
-        before, value = value, after
+    values = [torch.zeros_like(cosine), torch.ones_like(cosine)]
+    for degree in range(count - 1):
+        before, value = values[-2:]
+        values.append(((2 * degree + 1) * cosine * value - degree * before) / (degree + 1))
+    return torch.stack(values[1:], -1)
 
 
 def series_weights(moments: Tensor) -> Tensor:
@@ -69,30 +63,17 @@ def series_weights(moments: Tensor) -> Tensor:
     return (2 * degree + 1) * moments
 
 
-NEWTON_STEPS = 5
-"""From the first guess to all digits."""
-
-
 @functools.cache
 @torch.inference_mode(False)
-def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
-    """Cosines and weights [`count`] of Gauss's rule on [-1, 1], exact to degree 2 `count` - 1.
+def fejer(count: int) -> tuple[Tensor, Tensor]:
+    """Even angles and weights [`count`] of a rule over their cosines, exact to degree `count` - 1.
 
-    By Newton's method on P_count, all at once: NumPy's takes seconds for thousands of nodes.
+    Fejer's first rule (Waldvogel 2006, doi:10.1007/s10543-006-0045-4).
     """
-    place = torch.arange(count, dtype=torch.float64) + 0.75
-    cosine = torch.cos(place * (math.pi / (count + 0.5)))
-    for _ in range(NEWTON_STEPS):
-        value, slope = _last_legendre(cosine, count)
-        cosine = cosine - value / slope
-    _, slope = _last_legendre(cosine, count)
-    return cosine, 2 / ((1 - cosine**2) * slope**2)
-
-
-def _last_legendre(cosine: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """P_degree(`cosine`) and its derivative."""
-    before, value = deque(_each_legendre(cosine, degree + 1), maxlen=2)
-    return value, degree * (cosine * value - before) / (cosine**2 - 1)
+    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (math.pi / count)
+    k = torch.arange(1, count // 2 + 1, dtype=torch.float64)
+    series = torch.cos(2 * angle[:, None] * k) @ (1 / (4 * k**2 - 1))
+    return angle, (1 - 2 * series) * (2 / count)
 
 
 COEFFICIENTS = 12
