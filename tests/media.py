@@ -22,7 +22,7 @@ from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.values import value_of, varied, with_values
+from ddrecon.variables.values import value_of, with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -158,18 +158,6 @@ def convergence_order(steps: list[float], errors: list[float]) -> float:
     y = torch.tensor(errors, dtype=torch.float64).log()
     x = x - x.mean()
     return float((x * y).sum() / (x * x).sum())
-
-
-def render_tangent(
-    scene: Scene, name: str, images_of: Callable[[Scene], dict[Any, Tensor]]
-) -> dict[Any, tuple[Tensor, Tensor]]:
-    """What `images_of` renders of `scene`, each with its derivative by `name`."""
-    with varied(scene, name) as world:
-        pairs = {key: forward_ad.unpack_dual(image) for key, image in images_of(world).items()}
-        return {
-            key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
-            for key, (primal, tangent) in pairs.items()
-        }
 
 
 def assert_derivatives(

@@ -24,6 +24,7 @@ MEDIA = (
     " {smoke: {density: 0.7, sigma_a: 1, sigma_s: 3, g: 0.5},"
     " air: {density: 1, sigma_a: 0, sigma_s: 1, phase: {type: rayleigh}}}}"
 )
+SECTIONS = "sigma_a", "sigma_s", "sigma_t", "albedo"
 PHASES = {"phase.g": LOBES, "phase.weight": LOBES, "media.NAME.g": MEDIA}
 """Volumes that have numbers of phase functions other than g."""
 
@@ -59,9 +60,11 @@ def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes: dict[str, 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("pattern", KINDS)
-def test_a_kind_is_settable_and_differentiable(scene: Scene, pattern: str) -> None:
+def test_a_kind_is_settable_alone_and_differentiable(scene, pattern):
+    """The scene keeps its own value, and what is put in comes out again; all else stays."""
     name = name_of(pattern, scene)
-    value = (0.9 * value_of(scene, name) + 0.01).requires_grad_()
+    before = value_of(scene, name).clone()
+    value = (0.9 * before + 0.01).requires_grad_()
     changed = with_values(scene, {name: value})
     view = name.split(".")[1] if name.startswith("views.") else "front"
     image = render(changed, view)
@@ -71,6 +74,11 @@ def test_a_kind_is_settable_and_differentiable(scene: Scene, pattern: str) -> No
     # a camera that was moved is as far from itself as before: not at all
     expected = torch.zeros_like(value) if pattern == "views.NAME.camera" else value
     torch.testing.assert_close(value_of(changed, name), expected, rtol=1e-14, atol=0)
+    owner, _, key = name.rpartition(".")
+    follows = {f"{owner}.{section}".strip(".") for section in SECTIONS if key in SECTIONS}
+    for other in {*variable_names(scene)} - follows - {name}:
+        assert torch.equal(value_of(changed, other), value_of(scene, other)), other
+    assert torch.equal(value_of(scene, name), before)
 
 
 @pytest.mark.parametrize("pattern", KINDS)
