@@ -41,17 +41,6 @@ def test_fluence_of_a_beam_that_is_absorbed_is_its_mean_in_each_cell() -> None:
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"g": 0.7}, {"model": "none"}, {"g": 0.7, "model": "none"}]
-)
-def test_fluence_of_even_light_without_absorption_is_4_pi_times_it(changes: dict[str, Any]) -> None:
-    shape, sigma_s = (5, 4, 6), 0.0 if "model" in changes else 6.0
-    medium = {"sigma_a": (0.0,), "sigma_s": (sigma_s,), **changes}
-    scene = lit_by(AmbientLight(tensor(0.7)), random_values(*shape), **medium)
-    expected = torch.full((1, *shape), 4 * math.pi * 0.7, dtype=torch.float64)
-    torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
-
-
 @pytest.mark.parametrize("scene", [{"g": 0.0}, {"g": 0.85, "degree": 3}], ids=str)
 @pytest.mark.parametrize("light", [SLANTED, WIDE], ids=["sun", "beam"])
 def test_fluence_has_tangent_adjoint_and_differences(light: Light, scene: dict[str, Any]) -> None:

@@ -12,7 +12,6 @@ from media import (
     LOWER,
     UPPER,
     assert_image_derivatives,
-    half_empty,
     light_of,
     make_camera,
     make_scene,
@@ -117,18 +116,6 @@ def test_an_even_map_is_a_number() -> None:
     even = ground.albedo.view(3, 1, 1).expand(3, 5, 7)
     found = render(replace(scene, ground=replace(ground, albedo=even)))
     torch.testing.assert_close(found, known, rtol=1e-12, atol=0)
-
-
-@pytest.mark.parametrize("form", ["ambient", "environment"])
-@pytest.mark.parametrize("g", [0.0, 0.4])
-def test_a_white_furnace_is_white(form: str, g: float) -> None:
-    """Ground and medium reflect all light, and from everywhere comes the same."""
-    density = 3 * half_empty(*SHAPE)
-    made = {"sigma_a": (0.0,), "sigma_s": (8.0,), "g": g, "transport_rounds": 1, "degree": 3}
-    scene = on_ground(density, albedo=(1.0,), directional=None, **made)
-    sky = EnvironmentLight(tensor(1.0).expand(1, 4, 6), tensor(1.0)[0], tensor(0.0)[0])
-    scene.lights = [AmbientLight(tensor(1.0)) if form == "ambient" else sky]
-    torch.testing.assert_close(render(scene), torch.ones(1, 3, 6, 7).double(), rtol=1e-9, atol=0)
 
 
 def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:

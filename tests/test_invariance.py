@@ -25,6 +25,7 @@ from torch.nn.functional import pad
 from ddrecon import lighting
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import (
@@ -132,6 +133,32 @@ def test_halves_of_derivatives_sum_to_all_and_have_the_same_image(feature: str) 
     assert_near(one, image, 1e-12)
     assert_near(other, image, 1e-12)
     assert_near(first_bar + second_bar, bar, 1e-12)
+
+
+COLORS = tensor(0.7, 0.3, 0.1)
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("feature", [name for name in FEATURES if name != "index"])
+def test_what_is_as_hot_as_its_surroundings_looks_like_them(feature, engine):
+    """With j = kappa_a B, and B from everywhere, light is B everywhere; so it is in a white furnace.
+
+    Where nothing is scattered twice nothing scatters, and a ground reflects all.
+    """
+    use_engine(engine)
+    scene = scene_with(feature)
+    nothing, plane = torch.zeros_like(scene.volume.sigma_s), Plane(-0.7, 1)
+    ground = Ground(tensor(1), plane) if scene.ground else None
+    volume = replace(scene.volume, emission=None, black_body=COLORS)
+    if scene.diffusion.model == "none":
+        volume = replace(volume, sigma_s=nothing)
+    for furnace in (volume, replace(volume, sigma_a=nothing, black_body=None)):
+        hot = replace(scene, volume=furnace, lights=[AmbientLight(COLORS)], ground=ground)
+        (image,), light = render(hot), fluence_of(solve_light(hot, SolveMemory()), hot.diffusion)
+        expected = 4 * math.pi * COLORS.view(3, 1, 1, 1).expand_as(light)
+        torch.testing.assert_close(image, COLORS.view(3, 1, 1).expand_as(image), rtol=1e-9, atol=0)
+        if furnace.sigma_s.any() or not furnace.sigma_a.any():  # fluence is of what is followed
+            torch.testing.assert_close(light, expected, rtol=1e-9, atol=0)
 
 
 CLOUD, CELL = (8, 10, 10), 0.1

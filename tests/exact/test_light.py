@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import half_empty, make_camera, make_scene
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
@@ -53,26 +53,6 @@ def test_an_even_box_shines_by_its_length(engine: str, model: str, density: floa
     length = (1 - math.exp(-kappa)) / kappa if kappa else 1.0
     image = render(glowing(density, COLORS, model=model))[0]
     torch.testing.assert_close(image, (COLORS * length).view(3, 1, 1).expand_as(image))
-
-
-MODELS = [{"transport_rounds": 2}, {"transport_rounds": 2, "g": 0.5, "degree": 3}]
-MODELS += [{"model": "flux_limited"}, {"scheme": "printed"}]
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("more", MODELS, ids=str)
-def test_what_is_as_hot_as_its_surroundings_looks_like_them(
-    engine: str, more: dict[str, Any]
-) -> None:
-    """Thermal equilibrium: with j = kappa_a B, and B from everywhere, light is B everywhere."""
-    use(engine)
-    density = 0.2 + random_values(*GRID.shape)
-    scene = glowing(density, None, sigma_s=(5.0,), ambient=COLORS.tolist(), **more)
-    scene.volume.black_body = COLORS
-    found = solve_light(scene, SolveMemory()).diffuse[0]
-    torch.testing.assert_close(found, COLORS.view(3, 1, 1, 1).expand_as(found), rtol=1e-9, atol=0)
-    image = render(scene)[0]
-    torch.testing.assert_close(image, COLORS.view(3, 1, 1).expand_as(image), rtol=1e-9, atol=0)
 
 
 def test_an_image_is_the_sum_of_what_lamps_and_emission_show() -> None:

@@ -275,14 +275,6 @@ def test_between_the_numbers_of_its_table_s_is_that_of_the_number(
 
 
 @each_field
-@pytest.mark.parametrize("rounds", [0, 2])
-def test_a_white_furnace_stays_white(phase: PhaseFunction, rounds: int):
-    changes = {"sigma_a": (0.0, 0.0, 0.0), "directional": None, "ambient": (0.7,)}
-    image = render(scene_of(phase, transport_rounds=rounds, **changes))
-    torch.testing.assert_close(image, torch.full_like(image, 0.7), rtol=1e-10, atol=0)
-
-
-@each_field
 def test_cells_without_scattering_have_no_phase_function(phase: PhaseFunction):
     """Their number changes moments of nothing, and its derivative is zero and finite."""
     density = random_values(*SHAPE)
