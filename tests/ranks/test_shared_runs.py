@@ -10,52 +10,37 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from small_scene import SCENE
 
 from ddrecon.run.job import load_checkpoint
+from ddrecon.scene_file.load import scene_text
 
 pytestmark = pytest.mark.slow
 Job = dict[str, Any]
 """As `forked.py` takes them."""
-SCENE = """\
-volume:
-  bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}
-  resolution: [8, 6, 5]
-  density: 0.5
-  sigma_a: 0.5
-  sigma_s: [6, 5, 4]
-  g: 0.3
-lights:
-  - {type: directional, direction: [-1, -2, -1], irradiance: 3}
-diffusion: {transport_rounds: 0}
-optimize:
-  loss: l2
-  parameters:
-    density: {init: 0.4, tv: 1e-3}
-    sigma_s: {field: true}
-    g: {}
-    lights.0.irradiance: {}
-    views.c.camera: {}
-    views.*.exposure: {}
-    views.*.offset: {}
-views:
-"""
-VIEWS = {"a": (0, 0, 2.5), "b": (2.5, 0, 0), "c": (0, 0.5, -2)}
-TESTS = {"d": (2, 1, 1), "e": (-2, -1, 1)}
+VIEWS = {"a": (0, 0, 2.5), "b": (2.5, 0, 0), "c": (0, 0.5, -2), "d": (2, 1, 1), "e": (-2, -1, 1)}
+"""Two of which are test views."""
+SOUGHT = """{density: {init: 0.4, tv: 0.001}, sigma_s: {field: true}, g: {},
+ lights.0.irradiance: {}, views.c.camera: {}, views.*.exposure: {}, views.*.offset: {}}"""
 
 
 def write_scene(folder: Path) -> None:
-    """A scene of five training views of two sizes, and two test views."""
-    text = SCENE
-    for number, (name, origin) in enumerate((VIEWS | TESTS).items()):
+    """The small scene in five views of two sizes, of which all kinds of numbers are sought."""
+    tree = yaml.safe_load(SCENE)
+    tree["volume"] |= {"resolution": [8, 6, 5], "density": 0.5}
+    tree["optimize"] = {"loss": "l2", "parameters": yaml.safe_load(SOUGHT)}
+    camera, tree["lights"] = tree["views"][0]["camera"], tree["lights"][:1]
+    tree["views"] = []
+    for number, (name, origin) in enumerate(VIEWS.items()):
         width, height = (8, 6) if number % 2 else (10, 8)
         y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
         blob = np.maximum(0.4 + 0.03 * number - x**2 - (y - 0.05 * number) ** 2, 0.1)
         np.save(folder / f"{name}.npy", blob[..., None] * [1.0, 0.8, 0.6])
-        camera = f"origin: {list(origin)}, target: [0, 0, 0], resolution: [{width}, {height}]"
-        split = "test" if name in TESTS else "train"
-        text += f"  - {{name: {name}, image: {name}.npy, split: {split},\n"
-        text += f"     camera: {{type: perspective, fov: 30, {camera}}}}}\n"
-    (folder / "scene.yaml").write_text(text)
+        view = {"name": name, "image": f"{name}.npy", "split": "test" if name in "de" else "train"}
+        view["camera"] = camera | {"origin": [*origin], "resolution": [width, height]}
+        tree["views"].append(view)
+    (folder / "scene.yaml").write_text(scene_text(tree))
 
 
 def job(ranks: int, output: str, *options: str, **others: Any) -> Job:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_scene import write_scene
 from torch import Tensor
 
 from ddrecon.io.files.folders import RUN, claim_folder
@@ -16,33 +17,14 @@ from ddrecon.picture import render
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import Run
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
-CROSS_SECTIONS = {
-    "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",
-    "sigma_t, albedo": "sigma_t: 7\n  albedo: [0.9, 0.8, 0.7]",
-}
-SCENE = """\
-volume:
-  bounds: {{min: [-0.5, -0.4, -0.5], max: [0.5, 0.5, 0.6]}}
-  resolution: [6, 5, 4]
-  density: 0.4
-  {cross_sections}
-  {phase}
-lights:
-  - {{type: directional, direction: [-1, -2, -1], irradiance: 3}}
-  - {{type: environment, file: sky.npy, scale: 0.5, rotation: 20, directions: 6}}
-  - {{type: point, position: [0.9, 0.8, 0.3], intensity: 1}}
-views:
-  - name: front
-    image: front.npy
-    camera: {{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}}
-  - name: side
-    camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1,
-      resolution: [5, 4]}}
-diffusion: {{transport_rounds: 0}}
-optimize: {{iterations: 2, parameters: {{{parameters}}}}}
-"""
+MEDIA = "sigma_a: 0.5, sigma_s: [6, 5, 4]", "sigma_t: 7, albedo: [0.9, 0.8, 0.7]"
+BOX = "bounds: {min: [-0.5, -0.4, -0.5], max: [0.5, 0.5, 0.6]}"
+LIGHTS = """[{type: directional, direction: [-1, -2, -1], irradiance: 3},
+ {type: environment, file: %s/sky.npy, scale: 0.5, rotation: 20, directions: 6},
+ {type: point, position: [0.9, 0.8, 0.3], intensity: 1}]"""
+FLAT = "{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [5, 4]}"
 VARIED = [
     ("density: {init: 0.2}", ["density"]),
     ("sigma_a: {init: [0.5, 1, 2], field: true}, sigma_s: {}", ["sigma_a"]),
@@ -63,14 +45,16 @@ def moved(value: Tensor) -> Tensor:
     return value * (1.1 + 0.1 * random) + 0.01
 
 
-def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g: 0.3") -> Any:
+def finished(folder: Path, medium: str, parameters: str, phase: str = "g: 0.3") -> Any:
     """The scene found by a run in `folder`/out that ended, all its parameters moved."""
-    path = folder / "scene.yaml"
-    values = {"cross_sections": cross_sections, "parameters": parameters, "phase": phase}
-    path.write_text(SCENE.format(**values))
-    random = np.random.default_rng(0)
-    np.save(folder / "front.npy", random.random((6, 7, 3), dtype=np.float32))
+    path, random = write_scene(folder), np.random.default_rng(0)
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
+    overrides = [
+        f"volume={{{BOX}, resolution: [6, 5, 4], density: 0.4, {medium}, {phase}}}",
+        *(f"lights={LIGHTS % folder}", f"views.1={{name: side, camera: {FLAT}}}"),
+        f"optimize={{iterations: 2, parameters: {{{parameters}}}}}",
+    ]
+    dump_scene(describe(read_scene(path, overrides)), path)
     scene_file = read_scene(path)
     job = Run(build_scene(scene_file), scene_file, {})
     with claim_folder(folder / "out", RUN) as claimed:
@@ -91,7 +75,7 @@ def test_a_result_renders_as_what_was_found(
     tmp_path: Path, number: int, parameters: str, fields: Sequence[str]
 ) -> None:
     # Both ways to give cross sections, by turns.
-    found = finished(tmp_path, list(CROSS_SECTIONS.values())[number % 2], parameters)
+    found = finished(tmp_path, MEDIA[number % 2], parameters)
     # Wherever its folder lies.
     folder = (tmp_path / "out").rename(tmp_path / "moved")
     again = load_scene(folder / RESULT)
@@ -112,8 +96,7 @@ PHASES = {"{type: henyey_greenstein, g: 0.3}": "g: {}", LOBES: "phase.g: {}, pha
 def test_a_result_has_the_phase_function_that_was_found(
     tmp_path: Path, phase: str, parameters: str
 ) -> None:
-    text = CROSS_SECTIONS["sigma_a, sigma_s"]
-    found = finished(tmp_path, text, parameters, f"phase: {phase}").volume.phase
+    found = finished(tmp_path, MEDIA[0], parameters, f"phase: {phase}").volume.phase
     again = load_scene(tmp_path / "out" / RESULT).volume.phase
     assert type(again) is type(found)
     for one, other in zip(tensors_in(again), tensors_in(found), strict=True):
@@ -123,13 +106,8 @@ def test_a_result_has_the_phase_function_that_was_found(
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
     box = np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]])
     write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), box)
-    text = CROSS_SECTIONS["sigma_t, albedo"]
-    found = finished(tmp_path, text, "density: {}")
-    text = (tmp_path / "scene.yaml").read_text().replace("  resolution: [6, 5, 4]\n", "")
-    scene = text.replace("density: 0.4", "density: {file: start.npz}")
-    (tmp_path / "scene.yaml").write_text(scene)
-    assert (
-        load_scene(tmp_path / "scene.yaml").volume.grid
-        == found.volume.grid
-        == load_scene(tmp_path / "out" / RESULT).volume.grid
-    )
+    found = finished(tmp_path, MEDIA[1], "density: {}")
+    start = ["volume.resolution=~", f"volume.density={{file: {tmp_path}/start.npz}}"]
+    scene = load_scene(tmp_path / "scene.yaml", overrides=start)
+    grids = scene.volume.grid, load_scene(tmp_path / "out" / RESULT).volume.grid
+    assert grids == (found.volume.grid,) * 2
