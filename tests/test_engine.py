@@ -13,7 +13,7 @@ import pytest
 
 import ddrecon
 from ddrecon import engine
-from ddrecon.engine import current_engine, engine_versions
+from ddrecon.engine import current_engine
 from ddrecon.errors import FormatError, MissingExtraError, UsageError
 from ddrecon.extras import EXTRAS, load_extra, load_for_file
 
@@ -74,13 +74,6 @@ def test_the_environment_chooses(
     assert current_engine() == expected
     ddrecon.use_engine("torch")
     assert current_engine() == "torch"
-
-
-def test_its_version_is_told(installed: None) -> None:
-    ddrecon.use_engine("torch")
-    assert engine_versions() == {"engine": "torch"}
-    ddrecon.use_engine("warp")
-    assert engine_versions() == {"engine": "warp", "warp-lang": "9.8.7"}
 
 
 def test_to_choose_imports_no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +162,3 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, package: str)
     with pytest.raises(FormatError) as refused:
         load_for_file(package, "smoke.abc")
     assert str(refused.value) == f"smoke.abc: {advice}"
-
-
-def test_what_is_there_is_loaded() -> None:
-    assert load_extra("sys", "nothing") is sys and load_for_file("sys", "smoke.abc") is sys

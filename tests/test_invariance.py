@@ -141,7 +141,7 @@ COLORS = tensor(0.7, 0.3, 0.1)
 @pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("feature", [name for name in FEATURES if name != "index"])
 def test_what_is_as_hot_as_its_surroundings_looks_like_them(feature, engine):
-    """With j = kappa_a B, and B from everywhere, light is B everywhere; so it is in a white furnace.
+    """With j = kappa_a B, and B from everywhere, light is B everywhere; so in a white furnace.
 
     Where nothing is scattered twice nothing scatters, and a ground reflects all.
     """

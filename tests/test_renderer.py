@@ -88,17 +88,6 @@ def test_rays_that_meet_no_medium_show_exactly_what_is_behind():
     assert bool((image[:, ~is_miss] < 1).any())
 
 
-@pytest.mark.parametrize("g", [0.6, -0.6])
-def test_a_parallel_camera_is_a_perspective_one_from_afar(g: float):
-    far = 1e4
-    images = []
-    for half_width, is_near in ((0.45, False), (0.45 / far, True)):
-        eye = (0.0, 0.6 * far, 0.8 * far)
-        camera = make_camera(eye, half_width=half_width, is_perspective=is_near)
-        images.append(render(make_scene(half_empty(*SHAPE), g=g, camera=camera)))
-    torch.testing.assert_close(images[0], images[1], rtol=10 / far, atol=0)
-
-
 # --- scalings and symmetries ---
 
 
