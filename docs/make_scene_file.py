@@ -1,4 +1,4 @@
-"""Makes scene_file.md and expert_keys.md, the manual of scene files, and scene.schema.json.
+"""Makes scene_file.md, the manual of scene files, and scene.schema.json.
 
 Keys, kinds, limits and defaults are those the program checks. Run it after each change of them:
 
@@ -11,8 +11,9 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
+from itertools import groupby
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
@@ -24,12 +25,15 @@ from ddrecon.scene_file.read import describe_type
 from ddrecon.variables.kinds import KINDS
 
 FOLDER = Path(__file__).parent
-EXPERT = """\
-# Keys for experts
+COLUMNS = "takes | default | what |"
+EXPERT = f"""\
+## Keys for experts
 
 No scene needs them: they choose between ways to compute the same, for comparisons and experiments.
-They stand in the sections of [the scene file](scene_file.md) that are named here.
-`ddrecon check` tells which of them are not at their default."""
+`ddrecon check` tells which of them are not at their default.
+
+| in | key | {COLUMNS}
+|---|---|---|---|---|"""
 INTRODUCTION = """\
 Every key, with what it takes, its limits and its default, made from the program's own schema.
 
@@ -40,7 +44,7 @@ Every key, with what it takes, its limits and its default, made from the program
 - Three equal colors are rendered as one, unless they are optimized.
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
-[Keys for experts](expert_keys.md) have a page of their own.
+[Keys for experts](#keys-for-experts) stand at the end.
 Small scenes with other phase functions, models and losses are in `configs/kinds`.
 
 Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json).
@@ -84,9 +88,9 @@ SECTIONS: list[tuple[str, type]] = [
     ("views: {ring: ...}, {transforms: ...} or {colmap: ...}", view_schema.ViewSource),
     ("views: {ring: ...}", view_schema.RingSection),
     ("camera: {type: perspective}", view_schema.PerspectiveSection),
+    ("camera: {type: orthographic}", view_schema.OrthographicSection),
     ("distortion: {type: opencv}", view_schema.OpencvSection),
     ("distortion: {type: fisheye}", view_schema.FisheyeSection),
-    ("camera: {type: orthographic}", view_schema.OrthographicSection),
     ("frames", view_schema.FramesSection),
     ("render", settings.RenderSettings),
     ("diffusion", settings.DiffusionSettings),
@@ -105,10 +109,9 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """The text of each page, by the name of its file."""
-    manual = ["# The scene file", INTRODUCTION, *_sections(is_expert=False), _parameters()]
+    manual = ["# The scene file", INTRODUCTION, *_sections(), _parameters(), _experts()]
     return {
         "scene_file.md": "\n\n".join(manual) + "\n",
-        "expert_keys.md": "\n\n".join([EXPERT, *_sections(is_expert=True)]) + "\n",
         "scene.schema.json": json_schema(),
     }
 
@@ -129,22 +132,63 @@ def explain(record: type) -> tuple[str, dict[str, str]]:
     return re.sub(r"(?<=\.) (?=[A-Z`\[])", "\n", " ".join(introduction.split())), ordered
 
 
-def _sections(is_expert: bool) -> list[str]:
-    """Each section, with a table of its keys that are for experts, or of the others."""
-    sections = []
-    for heading, record in SECTIONS:
-        introduction, sentences = explain(record)
-        hints = type_hints(record)
-        rows = _joined(
-            (key.name, f"{_takes(hints[key.name], key)} | {_default(key)} | {sentences[key.name]}")
-            for key in fields(record)
-            if bool(key.metadata.get("expert")) == is_expert
-        )
-        table = ["", "| key | takes | default | what |", "|---|---|---|---|", *rows] if rows else []
-        if rows or not is_expert:
-            lead = [] if is_expert else ["", introduction]
-            sections.append("\n".join([f"## {heading}", *lead, *table]))
+def _sections() -> list[str]:
+    """Each section with a table of its keys; kinds of the same thing have one together."""
+    sections, told = [], dict[str, str]()
+    for place, group in groupby(SECTIONS, lambda section: section[0].partition(": {")[0]):
+        kinds = list(group)
+        if len(kinds) > 1 and all(": {" in heading for heading, _ in kinds):
+            sections.append(_kinds(place, kinds))
+            continue
+        for heading, record in kinds:
+            rows = dict(_rows(record))
+            above = {name: told[text] for text, name in rows.items() if text in told}
+            told |= dict.fromkeys(rows, heading)
+            lead = [explain(record)[0]]
+            for owner in dict.fromkeys(above.values()):
+                names = ", ".join(f"`{name}`" for name, of in above.items() if of == owner)
+                lead.append(f"As in `{owner}`: {names}.")
+            rows = {text: name for text, name in rows.items() if name not in above}
+            table = _joined((name, text) for text, name in rows.items())
+            head = ["", f"| key | {COLUMNS}", "|---|---|---|---|"] if rows else []
+            sections.append("\n".join([f"## {heading}", "", *lead, *head, *table]))
     return sections
+
+
+def _kinds(place: str, kinds: list[tuple[str, type]]) -> str:
+    """What `place` may be: what each kind is, then their keys; keys of several stand once."""
+    lines, owners = [f"## {place}", ""], dict[tuple[str, str], list[str]]()
+    for heading, record in kinds:
+        kind = heading.removeprefix(f"{place}: ")
+        name = f"`{kind.removeprefix('{type: ').removesuffix('}') if 'type: ' in kind else kind}`"
+        lines.append(f"- {name}: " + explain(record)[0].replace("\n", "\n  "))
+        for text, key in _rows(record):
+            owners.setdefault((key, text), []).append(name)
+    lines += ["", f"| of | key | {COLUMNS}", "|---|---|---|---|---|"]
+    rows = dict[tuple[str, str], list[str]]()
+    for (key, text), names in owners.items():
+        rows.setdefault((", ".join(names), text), []).append(f"`{key}`")
+    lines += [f"| {of} | {', '.join(keys)} | {text} |" for (of, text), keys in rows.items()]
+    return "\n".join(lines)
+
+
+def _rows(record: type, is_expert: bool = False) -> Iterator[tuple[str, str]]:
+    """What a table has of each key of `record` that is for experts, or of the others; its name."""
+    sentences, hints = explain(record)[1], type_hints(record)
+    for key in fields(record):
+        if bool(key.metadata.get("expert")) == is_expert:
+            text = f"{_takes(hints[key.name], key)} | {_default(key)} | {sentences[key.name]}"
+            yield text, key.name
+
+
+def _experts() -> str:
+    """The table of keys that no scene needs."""
+    rows = [
+        f"| `{heading.partition(': {')[0]}` | `{name}` | {text} |"
+        for heading, record in SECTIONS
+        for text, name in _rows(record, is_expert=True)
+    ]
+    return "\n".join([EXPERT, *rows])
 
 
 def _joined(entries: Iterable[tuple[str, str]]) -> list[str]:
