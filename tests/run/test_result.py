@@ -45,7 +45,9 @@ def moved(value: Tensor) -> Tensor:
     return value * (1.1 + 0.1 * random) + 0.01
 
 
-def finished(folder: Path, medium: str, parameters: str, phase: str = "g: 0.3") -> Any:
+def finished(
+    folder: Path, medium: str, parameters: str, phase: str = "g: 0.3", start: Sequence[str] = ()
+) -> Any:
     """The scene found by a run in `folder`/out that ended, all its parameters moved."""
     path, random = write_scene(folder), np.random.default_rng(0)
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
@@ -53,6 +55,7 @@ def finished(folder: Path, medium: str, parameters: str, phase: str = "g: 0.3") 
         f"volume={{{BOX}, resolution: [6, 5, 4], density: 0.4, {medium}, {phase}}}",
         *(f"lights={LIGHTS % folder}", f"views.1={{name: side, camera: {FLAT}}}"),
         f"optimize={{iterations: 2, parameters: {{{parameters}}}}}",
+        *start,
     ]
     dump_scene(describe(read_scene(path, overrides)), path)
     scene_file = read_scene(path)
@@ -106,8 +109,8 @@ def test_a_result_has_the_phase_function_that_was_found(
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
     box = np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]])
     write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), box)
-    found = finished(tmp_path, MEDIA[1], "density: {}")
-    start = ["volume.resolution=~", f"volume.density={{file: {tmp_path}/start.npz}}"]
-    scene = load_scene(tmp_path / "scene.yaml", overrides=start)
-    grids = scene.volume.grid, load_scene(tmp_path / "out" / RESULT).volume.grid
-    assert grids == (found.volume.grid,) * 2
+    start = ["volume.bounds=~", "volume.resolution=~"]
+    start.append(f"volume.density={{file: {tmp_path}/start.npz}}")
+    found = finished(tmp_path, MEDIA[1], "density: {}", start=start)
+    assert load_scene(tmp_path / "out" / RESULT).volume.grid == found.volume.grid
+    assert found.volume.grid.shape == (4, 5, 6)
