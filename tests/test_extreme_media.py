@@ -1,10 +1,8 @@
 """Light and derivatives stay finite, and light positive, where media jump, clog or are opaque."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import half_empty, make_camera, make_scene
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -12,10 +10,6 @@ from ddrecon.lighting import solve_light
 from ddrecon.picture import render
 
 SHAPE = (6, 5, 7)
-
-
-def half_full(shape: tuple[int, int, int]) -> Tensor:
-    return (2 * random_values(*shape) - 1).clamp(min=0)
 
 
 def hot_voxel(shape: tuple[int, int, int]) -> Tensor:
@@ -31,13 +25,17 @@ def checkerboard(shape: tuple[int, int, int]) -> Tensor:
 
 @pytest.mark.parametrize(
     ("density", "sigma_a", "sigma_s"),
-    [(half_full, 10.0, 2.0), (hot_voxel, 0.5, 8.0), (checkerboard, 0.0, 8.0)],
+    [
+        (half_empty(*SHAPE), 10.0, 2.0),
+        (hot_voxel(SHAPE), 0.5, 8.0),
+        (checkerboard(SHAPE), 0.0, 8.0),
+    ],
 )
 def test_isotropic_light_is_never_negative_in_the_dark(
-    density: Callable[..., Tensor], sigma_a: float, sigma_s: float
+    density: Tensor, sigma_a: float, sigma_s: float
 ):
     """An M-matrix with a source >= 0; with g not 0, -div(D kappa_s Q1) may make L0 dip below 0."""
-    scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
+    scene = make_scene(density, sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).diffuse[0]
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0
 
@@ -45,13 +43,13 @@ def test_isotropic_light_is_never_negative_in_the_dark(
 FINITE = {
     "checkerboard": (checkerboard(SHAPE), {}),
     "hot voxel": (hot_voxel(SHAPE), {}),
-    "one cell": (half_full((1, 1, 1)), {}),
+    "one cell": (half_empty(1, 1, 1), {}),
     # Squares overflow there; so do exponentials of what rounding makes of no depth.
-    "thick": (1e10 * half_full(SHAPE), {}),
-    "opaque": (1e20 * half_full(SHAPE), {}),
+    "thick": (1e10 * half_empty(*SHAPE), {}),
+    "opaque": (1e20 * half_empty(*SHAPE), {}),
     # There the direction from the cell towards the camera is nothing but rounding.
-    "eye in a center": (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
-    "eye on a face": (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
+    "eye in a center": (half_empty(*SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
+    "eye on a face": (half_empty(*SHAPE), {"eye": (0.0, 0.0, 0.5)}),
 }
 
 

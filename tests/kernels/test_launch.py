@@ -37,3 +37,18 @@ def busy() -> Iterator[None]:
 def test_shares_that_no_thread_begins_are_done_by_the_one_that_asks(done, busy):
     launching.launch(object(), COUNT, [0, 1], HERE, threads=2)
     assert sorted(done) == [(0, 50, 0), (50, 51, 1)]
+
+
+@pytest.mark.parametrize(("threads", "shared"), [(2, 2), (None, 1), (1, 0)])
+def test_a_quick_launch_is_shared_where_threads_are_given(done, monkeypatch, threads, shared):
+    """By time goes only the second launch, which the first one told to be quick."""
+    shares: list[int] = []
+    share = launching._share
+    monkeypatch.setattr(launching, "thread_count", lambda like: 2)
+    monkeypatch.setattr(launching, "_seconds", {})
+    monkeypatch.setattr(launching, "_share", lambda *of: shares.append(1) or 0 * share(*of))
+    kernel = object()
+    for _ in range(2):
+        launching.launch(kernel, COUNT, [0], HERE, threads)
+    assert len(shares) == shared
+    assert sum(items for _, items, _ in done) == 2 * COUNT
