@@ -116,7 +116,7 @@ def folder(tmp_path, monkeypatch):
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
     """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
     before = {*folder.rglob("*")}
-    with deadline():
+    with deadline(5.0):
         result = CliRunner().invoke(main, list(arguments))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
