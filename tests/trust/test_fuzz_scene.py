@@ -168,7 +168,7 @@ LARGE = {
     "one long number": "volume: " + "9" * 1_000_000,
     "one long list": "views: [" + "1," * 60_000 + "1]",
     "broken at its end": "views:\n" + "- {camera: {}}\n" * 15_000 + "]",
-    "too large": "#" * (MAX_BYTES + 1),
+    "too large": SCENES[0] + "#" * MAX_BYTES,
 }
 
 
