@@ -77,14 +77,17 @@ def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
     torch.testing.assert_close(render(scene)[0], expected, rtol=1e-7, atol=0)
 
 
-def test_where_no_medium_is_near_a_ground_sends_back_its_part_of_sun_and_sky() -> None:
+@pytest.mark.parametrize("albedo", [tensor(*ALBEDO), random_values(3, 4, 6)], ids=["even", "map"])
+def test_where_no_medium_is_near_a_ground_sends_back_its_part_of_sun_and_sky(albedo):
     scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0.6, -0.8, 0.0))
     medium, sources = scale_medium(scene.volume), [*scene.lights, AmbientLight(tensor(0.5))]
-    lit = light_evenly(scene.ground, sources, medium.grid, scene.volume.density)
+    ground = replace(scene.ground, albedo=albedo)
+    lit = light_evenly(ground, sources, medium.grid, scene.volume.density)
     even, more = reflect(lit, medium, scene.render)
-    wanted = tensor(*ALBEDO) / math.pi * (0.8 * scene.lights[0].irradiance + math.pi * 0.5)
-    torch.testing.assert_close(even, wanted)
-    torch.testing.assert_close(more, torch.zeros_like(more), rtol=0, atol=1e-12)
+    irradiance = 0.8 * scene.lights[0].irradiance + math.pi * 0.5
+    torch.testing.assert_close(even, ground.mean_albedo / math.pi * irradiance)
+    sent, part = even.view(3, 1, 1) + more, ground.albedo_on(*more.shape[1:]) / math.pi
+    torch.testing.assert_close(sent, (part * irradiance).expand_as(sent))
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5])
