@@ -2,13 +2,11 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from hypothesis import settings
 from small_scene import write_scene
 from zero_tangents import ask_python
@@ -35,19 +33,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+def same_engine(monkeypatch):
     """No test depends on the engine that those before it used."""
     monkeypatch.setattr("ddrecon.engine._engine", None)
 
 
 @pytest.fixture(autouse=True)
-def same_seed() -> None:
+def same_seed():
     """No test depends on those before it; the seed decides which views an iteration looks at."""
     torch.manual_seed(0)
 
 
 @pytest.fixture(autouse=True)
-def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def surroundings(monkeypatch):
     """What commands change in their process is put back; Ctrl-C works in the background too."""
     threads = torch.get_num_threads()
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -58,7 +56,7 @@ def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """The current folder, with scene.yaml, its images front.npy and side.npy, and density.npz."""
     monkeypatch.chdir(tmp_path)
     write_scene(tmp_path)
@@ -66,14 +64,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def few_directions(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_directions(monkeypatch):
     """Of a ground's light, which goes along 72: what holds of any number is tried with few."""
     monkeypatch.setattr("ddrecon.march.ground.DOWNWARDS", 6)
     monkeypatch.setattr("ddrecon.light.ground.UPWARDS", 4)
 
 
 @pytest.fixture(scope="module")
-def shapes_by_python() -> Iterator[None]:
+def shapes_by_python():
     """For devices of their own, of which C++ knows no shapes of sums with numbers."""
     ask_python(everything=True)
     yield
@@ -81,16 +79,16 @@ def shapes_by_python() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", params=WRITTEN)
-def suffix(request: pytest.FixtureRequest) -> str:
+def suffix(request):
     """The suffix of each kind of volume file that is written and read."""
     return request.param
 
 
 @pytest.fixture
-def run(folder: Path) -> Callable[..., Result]:
+def run(folder):
     """Runs a command in the current folder, which `folder` made; a bug's exception is raised."""
 
-    def run_command(*arguments: str) -> Result:
+    def run_command(*arguments):
         result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception

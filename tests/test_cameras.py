@@ -27,9 +27,7 @@ ORIGIN, TARGET, UP = (
 )
 
 
-def camera(
-    size: tuple[int, int] = (3, 5), half_width: float = 0.4, is_perspective: bool = True
-) -> Camera:
+def camera(size=(3, 5), half_width=0.4, is_perspective=True):
     return Camera(look_at(ORIGIN, TARGET, UP), size, half_width, is_perspective)
 
 
@@ -46,16 +44,14 @@ def test_a_pose_is_rigid_and_looks_at_its_target():
 @pytest.mark.parametrize(
     ("target", "up"), [(ORIGIN, UP), (TARGET, TARGET - ORIGIN), (TARGET, 3 * (ORIGIN - TARGET))]
 )
-def test_a_view_without_a_direction_is_refused(target: torch.Tensor, up: torch.Tensor):
+def test_a_view_without_a_direction_is_refused(target, up):
     with pytest.raises(ValueError, match="do not span a view"):
         look_at(ORIGIN, target, up)
 
 
 @pytest.mark.parametrize(("aspect", "middle"), [(1.0, (0.5, 0.5)), (1.3, (0.44, 0.63))])
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_every_ray_against_explicit_pixel_arithmetic(
-    is_perspective: bool, aspect: float, middle: tuple[float, float]
-):
+def test_every_ray_against_explicit_pixel_arithmetic(is_perspective, aspect, middle):
     """Row 0 is the top, column 0 the left, and pixels are as high as said, whatever the shape."""
     view = camera(is_perspective=is_perspective)
     view = replace(view, pixel_aspect=aspect, principal_point=middle)
@@ -79,7 +75,7 @@ def test_only_perspective_rays_meet():
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective: bool):
+def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective):
     """Also where its size is no whole fraction, and whatever the principal point."""
     view = camera((7, 11), is_perspective=is_perspective)
     view = replace(view, principal_point=(0.3, 0.6), pixel_aspect=1.1)
@@ -93,7 +89,7 @@ def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective: bool):
 
 
 @given(st.integers(1, 64))
-def test_samples_are_centers_of_equal_parts(samples: int):
+def test_samples_are_centers_of_equal_parts(samples):
     offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
     assert len({(round(a, 9), round(b, 9)) for a, b in offsets.tolist()}) == samples
     assert offsets.mean(0).tolist() == pytest.approx([0.5, 0.5], abs=1e-14)
@@ -113,18 +109,18 @@ small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(
 
 
 @given(small_twists)
-def test_a_twisted_pose_is_rigid(change: torch.Tensor):
+def test_a_twisted_pose_is_rigid(change):
     turn = twist(camera(), change, PIVOT).pose[:, :3]
     torch.testing.assert_close(turn.T @ turn, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-13)
     assert torch.linalg.det(turn) > 0
 
 
 @given(small_twists)
-def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change: torch.Tensor):
+def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change):
     """Only a shift moves the pivot in the camera's own frame, by just as much the other way."""
     pivot = torch.tensor(PIVOT, dtype=torch.float64)
 
-    def seen(view: Camera) -> torch.Tensor:
+    def seen(view):
         return view.pose[:, :3].T @ (pivot - view.pose[:, 3])
 
     turn = change.clone()
@@ -136,7 +132,7 @@ def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change: torch.Tensor):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis: int):
+def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis):
     """A quarter turn about a camera axis takes the next axis to the one after it."""
     change = torch.zeros(6, dtype=torch.float64)
     change[axis] = math.pi / 2
@@ -152,11 +148,11 @@ LENSES = {
 }
 
 
-def lens_of(model: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+def lens_of(model, dtype=torch.float64):
     return torch.tensor(LENSES[model], dtype=dtype)
 
 
-def plainly(model: str, k: list[float], x: float, y: float, z: float) -> tuple[float, float]:
+def plainly(model, k, x, y, z):
     """The image of a direction, as OpenCV's manual writes it; k4 of `opencv` as nerfstudio's."""
     a, b = x / z, y / z
     if model == "opencv":
@@ -174,7 +170,7 @@ def plainly(model: str, k: list[float], x: float, y: float, z: float) -> tuple[f
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_a_direction_meets_the_image_where_the_manual_says(model: str) -> None:
+def test_a_direction_meets_the_image_where_the_manual_says(model):
     rays = [(0.0, 0.0, 1.0), (0.3, -0.2, 1.0), (-0.5, 0.4, 1.2), (0.01, 0.6, 0.9)]
     distorted = distort(model, lens_of(model), torch.tensor(rays, dtype=torch.float64))
     expected = [plainly(model, LENSES[model], *ray) for ray in rays]
@@ -183,7 +179,7 @@ def test_a_direction_meets_the_image_where_the_manual_says(model: str) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("model", LENSES)
-def test_there_and_back(model: str, dtype: torch.dtype) -> None:
+def test_there_and_back(model, dtype):
     """To rounding, from the axis to the corners; for a fisheye also sideways and behind."""
     steps = torch.linspace(-0.7, 0.7, 15, dtype=dtype)
     places = torch.cartesian_prod(steps, steps) * (3.0 if model == "fisheye" else 1.0)
@@ -193,7 +189,7 @@ def test_there_and_back(model: str, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_derivatives_are_those_of_the_inverse(model: str) -> None:
+def test_derivatives_are_those_of_the_inverse(model):
     """In both modes; on the axis too, where a fisheye's angle has a kink that its rays have not."""
     places = torch.tensor([[0.0, 0.0], [0.4, -0.3], [-0.1, 0.5]], dtype=torch.float64)
     inputs = (lens_of(model).requires_grad_(), places.requires_grad_())
@@ -202,14 +198,14 @@ def test_derivatives_are_those_of_the_inverse(model: str) -> None:
     )
 
 
-def lens_camera(model: str | None, **changes: object) -> Camera:
+def lens_camera(model, **changes):
     distortion = None if model is None else lens_of(model)
     camera = make_camera(size=(40, 36), half_width=0.35)
     return replace(camera, lens=model, distortion=distortion, **changes)
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_rays_of_pixels(model: str) -> None:
+def test_rays_of_pixels(model):
     """Off-center axis and oblong pixels; a coarser image has the same rays at its corners."""
     camera = lens_camera(model, principal_point=(0.45, 0.53), pixel_aspect=1.1)
     right, up, backward = camera.pose[:, :3].unbind(1)
@@ -222,7 +218,7 @@ def test_rays_of_pixels(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", [None, *LENSES])
-def test_a_point_is_found_in_the_largest_picture(model: str | None) -> None:
+def test_a_point_is_found_in_the_largest_picture(model):
     """Of 2^28 pixels, whose rays alone would take gigabytes."""
     whole = lens_camera(model, size=(1, 1), principal_point=(0.45, 0.53))
     side = 2.0**14

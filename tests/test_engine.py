@@ -21,22 +21,20 @@ ADVICE = 'needs warp: pip install "ddrecon[fast]"'
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def installed(monkeypatch):
     """warp-lang 9.8.7 is installed."""
     monkeypatch.setattr(engine, "find_spec", {"warp": "found"}.get)
     monkeypatch.setattr(metadata, "version", {"warp-lang": "9.8.7"}.get)
 
 
 @pytest.fixture
-def missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def missing(monkeypatch):
     """warp-lang is not installed."""
     monkeypatch.setattr(engine, "find_spec", {}.get)
 
 
 @pytest.mark.parametrize(("warp", "expected"), [("installed", "warp"), ("missing", "torch")])
-def test_auto_takes_warp_where_it_is_installed(
-    request: pytest.FixtureRequest, warp: str, expected: str
-) -> None:
+def test_auto_takes_warp_where_it_is_installed(request, warp, expected):
     request.getfixturevalue(warp)
     ddrecon.use_engine("auto")
     assert current_engine() == expected
@@ -49,9 +47,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_an_engine_that_is_not_there_is_refused(
-    missing: None, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_an_engine_that_is_not_there_is_refused(missing, monkeypatch, name):
     """By name and from the environment; the engine stays as it was."""
     kind, problem = REFUSED[name]
     monkeypatch.setenv("DDRECON_ENGINE", name)
@@ -67,23 +63,21 @@ def test_an_engine_that_is_not_there_is_refused(
 @pytest.mark.parametrize(
     ("value", "expected"), [("torch", "torch"), ("warp", "warp"), ("auto", "warp"), ("", "warp")]
 )
-def test_the_environment_chooses(
-    installed: None, monkeypatch: pytest.MonkeyPatch, value: str, expected: str
-) -> None:
+def test_the_environment_chooses(installed, monkeypatch, value, expected):
     monkeypatch.setenv("DDRECON_ENGINE", value)
     assert current_engine() == expected
     ddrecon.use_engine("torch")
     assert current_engine() == "torch"
 
 
-def test_to_choose_imports_no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_to_choose_imports_no_warp(monkeypatch):
     monkeypatch.delitem(sys.modules, "warp", raising=False)
     ddrecon.use_engine("auto")
     assert "warp" not in sys.modules
 
 
 @pytest.fixture(params=["/proc/nohome", None])
-def homeless(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def homeless(request, monkeypatch):
     """A home that cannot be written, or none at all."""
     for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, "")  # so that it is put back
@@ -96,12 +90,8 @@ def homeless(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_kernels_of_the_homeless_are_kept_among_temporary_files(
-    homeless: None,
-    installed: None,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    homeless, installed, monkeypatch, tmp_path, caplog
+):
     """Where others cannot write them; in torch where there is no such place, and not in `~`."""
     caplog.set_level("INFO", engine.LOG)
     monkeypatch.chdir(tmp_path)
@@ -126,7 +116,7 @@ PROJECTS = {"warp": "warp-lang"}
 """What pip calls a package, where that is another name than it is imported by."""
 
 
-def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
+def test_every_extra_brings_its_package_and_all_brings_every_extra():
     extras = {name: needs for name, needs in PROJECT.items() if name not in ("all", "dev", "docs")}
     assert set(extras) == set(EXTRAS.values())
     for package, name in EXTRAS.items():
@@ -135,7 +125,7 @@ def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
     assert PROJECT["all"] == [f"ddrecon[{','.join(extras)}]"]
 
 
-def test_what_is_imported_is_asked_for() -> None:
+def test_what_is_imported_is_asked_for():
     """Not merely brought along by what is, in whatever version that likes."""
     imported = set[str]()
     for path in (ROOT / "ddrecon").rglob("*.py"):
@@ -153,7 +143,7 @@ def test_what_is_imported_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("package", EXTRAS)
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+def test_a_missing_extra_is_named(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     advice = f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
     with pytest.raises(MissingExtraError) as caught:

@@ -8,7 +8,6 @@ import pytest
 import torch
 from media import half_empty, make_camera, make_scene, random_values
 from scenes import lamp, sky
-from torch import Tensor
 from torch.autograd import forward_ad as forward
 from twins import (
     assert_render_twins,
@@ -22,7 +21,6 @@ from twins import (
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.layer import VolumeRenderer
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import variable_names
@@ -38,13 +36,13 @@ CONFIGS = sorted(one for one in (ROOT / "configs").rglob("*.yaml") if one.stem n
 MOST_CELLS = 8
 
 
-def variables_of(scene: Scene) -> list[str]:
+def variables_of(scene):
     """All but those that others are made of."""
     return [name for name in variable_names(scene) if name not in ("sigma_t", "albedo")]
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_engines_agree_on_every_kind_of_config(config: Path) -> None:
+def test_engines_agree_on_every_kind_of_config(config):
     scene = load_scene(config, dtype=torch.float64)
     factor = -(-max(scene.volume.grid.shape) // MOST_CELLS)
     scene = scene_at_level(replace(scene, views=scene.views[:2]), factor)
@@ -77,7 +75,7 @@ EVERY_LIGHT = "cells", "forward, degree 1", "black"
 """Cases that have point lights and a sky besides."""
 
 
-def scene_of(case: str) -> Scene:
+def scene_of(case):
     """A scene whose density is 0 in half of its cells, seen through a lattice of rays."""
     camera = make_camera((0.3, 0.4, 3.0), (9, 8))
     scene = make_scene(half_empty(*SHAPE), camera=camera, **CASES[case])
@@ -87,7 +85,7 @@ def scene_of(case: str) -> Scene:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_engines_have_the_same_tangents_and_gradients(case: str) -> None:
+def test_engines_have_the_same_tangents_and_gradients(case):
     scene = scene_of(case)
     assert_render_twins(scene, variables_of(scene), has_tangent=True)
 
@@ -107,7 +105,7 @@ def test_single_precision_is_close_to_double(case, engine):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_tangents_are_transposes_of_adjoints_and_slopes(case: str) -> None:
+def test_tangents_are_transposes_of_adjoints_and_slopes(case):
     scene = scene_of(case)
     values = values_of(scene, [n for n in variables_of(scene) if not n.endswith(MOVES)])
     changes, show = {n: change_of(value, n) for n, value in values.items()}, images_of(scene)
@@ -123,14 +121,14 @@ def test_tangents_are_transposes_of_adjoints_and_slopes(case: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_gradients_are_those_of_the_pass_that_was_made(engine: str) -> None:
+def test_gradients_are_those_of_the_pass_that_was_made(engine):
     """Value, tangent and gradient may come of one pass, and another engine be chosen after it."""
     use_engine(engine)
     scene, change = scene_of("backward, degree 3"), random_values(*SHAPE, seed=5)
     leaf = scene.volume.density.clone().requires_grad_()
     show = images_of(scene)
 
-    def gradient(seen: Tensor) -> Tensor:
+    def gradient(seen):
         return torch.autograd.grad(seen.sum(), leaf)[0]
 
     before, other = (show({"density": leaf})[0] for _ in range(2))

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from media import half_empty, make_camera, make_scene
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.lighting import solve_light
@@ -12,14 +11,14 @@ from ddrecon.picture import render
 SHAPE = (6, 5, 7)
 
 
-def hot_voxel(shape: tuple[int, int, int]) -> Tensor:
+def hot_voxel(shape):
     """One cell of optical depth 1e4 under an extinction cross section of 1."""
     density = torch.zeros(shape, dtype=torch.float64)
     density[tuple(n // 2 for n in shape)] = 1e4 * max(shape)
     return density
 
 
-def checkerboard(shape: tuple[int, int, int]) -> Tensor:
+def checkerboard(shape):
     return 1e3 * (sum(torch.meshgrid(*map(torch.arange, shape), indexing="ij")) % 2).double()
 
 
@@ -31,9 +30,7 @@ def checkerboard(shape: tuple[int, int, int]) -> Tensor:
         (checkerboard(SHAPE), 0.0, 8.0),
     ],
 )
-def test_isotropic_light_is_never_negative_in_the_dark(
-    density: Tensor, sigma_a: float, sigma_s: float
-):
+def test_isotropic_light_is_never_negative_in_the_dark(density, sigma_a, sigma_s):
     """An M-matrix with a source >= 0; with g not 0, -div(D kappa_s Q1) may make L0 dip below 0."""
     scene = make_scene(density, sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).diffuse[0]
@@ -55,7 +52,7 @@ FINITE = {
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("case", FINITE)
-def test_image_and_gradient_are_finite(case: str, dtype: torch.dtype):
+def test_image_and_gradient_are_finite(case, dtype):
     density, view = FINITE[case]
     density = density.to(dtype).requires_grad_()
     camera = make_camera(dtype=dtype, **view)

@@ -7,15 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from far_device import FAR, near_kernels
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.reconstruct.frame import Result
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names
 
@@ -31,7 +28,7 @@ EVERY_RAY = "render.tolerance=0"
 """A processor interpolates pixels that are finer than cells, and a GPU does not."""
 
 
-def run(device: torch.device) -> Result:
+def run(device):
     """Two iterations; rounds are among the derivatives below."""
     overrides = ["diffusion.tolerance=0.01", CAPTURE]
     overrides += ["diffusion.transport_rounds=0", EVERY_RAY]
@@ -44,22 +41,20 @@ def run(device: torch.device) -> Result:
 
 
 @pytest.fixture(params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> str:
+def engine(request):
     if request.param == "warp":
         pytest.importorskip("warp")
     use_engine(request.param)
     return request.param
 
 
-def kernels_for(device: torch.device, engine: str) -> contextlib.AbstractContextManager[None]:
+def kernels_for(device, engine):
     return near_kernels() if device == FAR and engine == "warp" else contextlib.nullcontext()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES, ids=str)
-def test_iterations_there_find_what_they_find_on_the_processor(
-    device: torch.device, engine: str
-) -> None:
+def test_iterations_there_find_what_they_find_on_the_processor(device, engine):
     with kernels_for(device, engine):
         there = run(device)
     here = run(torch.device("cpu"))
@@ -69,7 +64,7 @@ def test_iterations_there_find_what_they_find_on_the_processor(
         assert one.test_psnr == pytest.approx(other.test_psnr, abs=1e-2)
 
 
-def mean_square(_: View, image: Tensor) -> Tensor:
+def mean_square(_, image):
     return image.square().mean()
 
 
@@ -88,9 +83,7 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES, ids=str)
 @pytest.mark.parametrize("name", CASES)
-def test_every_kind_of_derivative_is_found_there(
-    name: str, device: torch.device, engine: str
-) -> None:
+def test_every_kind_of_derivative_is_found_there(name, device, engine):
     config, overrides = CASES[name]
     found = []
     for place in (device, torch.device("cpu")):

@@ -2,25 +2,22 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from media import assert_derivatives, box_grid, make_scene, random_values, tensor
-from torch import Tensor
 
 import ddrecon
 from ddrecon.diffusion.cells import average
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
-from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Light
-from ddrecon.scene import Scene
+from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight
 from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
 
 
-def lit_by(light: Light, density: Tensor, **changes: Any) -> Scene:
+def lit_by(light, density, **changes):
     return replace(make_scene(density, **changes), lights=[light])
 
 
@@ -31,7 +28,7 @@ SLANTED = DirectionalLight(tensor(-2.0, -2.1, -1.0), tensor(3.0, 2.0, 1.0))
 BLACK = {"sigma_a": (1.5, 4.0, 9.0), "sigma_s": (0.0,)}
 
 
-def test_fluence_of_a_beam_that_is_absorbed_is_its_mean_in_each_cell() -> None:
+def test_fluence_of_a_beam_that_is_absorbed_is_its_mean_in_each_cell():
     density = random_values(1, 6, 1).expand(4, 6, 5).contiguous()
     found = ddrecon.fluence(lit_by(DOWN, density, **BLACK))
     step = average(density[None]) * box_grid((4, 6, 5)).spacing[1]
@@ -43,18 +40,18 @@ def test_fluence_of_a_beam_that_is_absorbed_is_its_mean_in_each_cell() -> None:
 
 @pytest.mark.parametrize("scene", [{"g": 0.0}, {"g": 0.85, "degree": 3}], ids=str)
 @pytest.mark.parametrize("light", [SLANTED, WIDE], ids=["sun", "beam"])
-def test_fluence_has_tangent_adjoint_and_differences(light: Light, scene: dict[str, Any]) -> None:
+def test_fluence_has_tangent_adjoint_and_differences(light, scene):
     world = lit_by(light, 0.2 + random_values(4, 5, 6), transport_rounds=1, **scene)
     names = ["density", *(f"lights.0.{name}" for name in vars(light))]
     weights, values = random_values(3, 4, 5, 6, seed=1), {n: value_of(world, n) for n in names}
 
-    def loss(named: dict[str, Tensor]) -> Tensor:
+    def loss(named):
         return (weights * ddrecon.fluence(with_values(world, named))).sum()
 
     assert_derivatives(loss, values)
 
 
-def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face() -> None:
+def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face():
     """Beer and Lambert, to rounding, also of a beam thinner than a cell."""
     density = random_values(1, 8, 1).expand(6, 8, 5).contiguous()
     for light, power in ((DOWN, 0.9 * DOWN.irradiance), (PENCIL, tensor(2.0, 2.0, 2.0))):
@@ -74,9 +71,7 @@ BEAMED = [(WIDE, 0.8, COLORED), (PENCIL, -0.6, WHITE)]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("light", "g", "sigma_a"), [*SUNLIT, *BEAMED])
-def test_what_enters_is_absorbed_or_leaves(
-    light: Light, g: float, sigma_a: tuple[float, ...]
-) -> None:
+def test_what_enters_is_absorbed_or_leaves(light, g, sigma_a):
     """Rounds that have come to rest lose nothing."""
     grid = Grid((10, 12, 10), (-0.5, -0.6, -0.5), (0.5, 0.6, 0.5))
     changes = {"transport_rounds": 12, "degree": 3, "tolerance": 1e-9, "grid": grid}
@@ -89,7 +84,7 @@ def test_what_enters_is_absorbed_or_leaves(
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_s", [0.0, 5.0])
 @pytest.mark.parametrize("has_ground", [False, True])
-def test_emission_enters_and_is_absorbed_or_leaves(has_ground: bool, sigma_s: float) -> None:
+def test_emission_enters_and_is_absorbed_or_leaves(has_ground, sigma_s):
     """The ground reflects a part of what falls on it, and less enters again."""
     emission = random_values(1, 6, 7, 5)
     changes = {"transport_rounds": 12, "degree": 3, "tolerance": 1e-9, "directional": None}
@@ -106,7 +101,7 @@ def test_emission_enters_and_is_absorbed_or_leaves(has_ground: bool, sigma_s: fl
         assert 0 < record["enters"]["ground"] < 0.7 * record["into_ground"]
 
 
-def test_a_white_furnace_over_a_white_ground_is_in_balance() -> None:
+def test_a_white_furnace_over_a_white_ground_is_in_balance():
     changes = {"sigma_a": (0.0,), "sigma_s": (6.0,), "g": 0.4, "transport_rounds": 2, "degree": 3}
     scene = lit_by(AmbientLight(tensor(0.5)), random_values(4, 5, 6), **changes)
     record = find_balance(replace(scene, ground=Ground(tensor(1.0), Plane(-0.7, 1))))
@@ -117,7 +112,7 @@ def test_a_white_furnace_over_a_white_ground_is_in_balance() -> None:
     assert abs(record["defect_percent"]) < 1e-7
 
 
-def test_a_ground_in_the_sun_lights_a_box_from_below_and_half_of_its_sides() -> None:
+def test_a_ground_in_the_sun_lights_a_box_from_below_and_half_of_its_sides():
     scene = lit_by(DOWN, torch.zeros(4, 5, 6, dtype=torch.float64))
     record = find_balance(replace(scene, ground=Ground(tensor(0.4), Plane(-0.7, 1))))
     area = 1.0 * 0.9 + 1.2 * (1.0 + 0.9)
@@ -125,7 +120,7 @@ def test_a_ground_in_the_sun_lights_a_box_from_below_and_half_of_its_sides() -> 
     assert record["enters"]["ground"] == pytest.approx(expected, rel=0.004)
 
 
-def test_a_ground_sends_back_its_part_of_a_pencil() -> None:
+def test_a_ground_sends_back_its_part_of_a_pencil():
     """The box stands on it: what it reflects enters, as well as 24 directions say."""
     scene = lit_by(PENCIL, torch.zeros(10, 12, 10, dtype=torch.float64))
     record = find_balance(replace(scene, ground=Ground(tensor(0.4), Plane(-0.6, 1))))
@@ -133,7 +128,7 @@ def test_a_ground_sends_back_its_part_of_a_pencil() -> None:
     assert record["enters"]["ground"][0] == pytest.approx(0.8, rel=0.1)
 
 
-def test_a_balance_needs_light_and_somebody_who_follows_it() -> None:
+def test_a_balance_needs_light_and_somebody_who_follows_it():
     density = random_values(3, 4, 5)
     with pytest.raises(UsageError, match="none enters"):
         find_balance(replace(make_scene(density), lights=[]))

@@ -27,7 +27,7 @@ def test_centers_against_explicit_indices():
 
 
 @given(st.tuples(*[st.integers(1, 40)] * 3), st.integers(1, 50))
-def test_a_coarsened_grid_fills_the_same_box(shape: tuple[int, int, int], factor: int):
+def test_a_coarsened_grid_fills_the_same_box(shape, factor):
     coarse = Grid(shape, (0, 0, 0), (1, 2, 3)).coarsen(factor)
     assert coarse.bounds_xyz == ((0, 0, 0), (3, 2, 1))
     for cells, fine in zip(coarse.shape, shape, strict=True):
@@ -42,7 +42,7 @@ def test_array_order_is_its_own_inverse():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_slices_are_met_in_their_order_and_lifted_back_to_cells(axis: int, sign: int):
+def test_slices_are_met_in_their_order_and_lifted_back_to_cells(axis, sign):
     cells, speed = random_values(2, 3, 4, 5), [0.3, -0.3, 0.3]
     speed[axis] = 2.0 * sign
     slicing = Slicing.of(speed)

@@ -18,7 +18,6 @@ from media import (
     random_values,
     tensor,
 )
-from torch import Tensor
 
 from ddrecon import lighting
 from ddrecon.cameras import Camera, look_at
@@ -30,14 +29,13 @@ from ddrecon.light.lights import (
     BeamLight,
     DirectionalLight,
     EnvironmentLight,
-    Light,
     PointLight,
 )
 from ddrecon.light.sky import decompose_map
 from ddrecon.march.ground import light_evenly, reflect
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
@@ -48,15 +46,13 @@ VIEW = {"eye": (0.5, 1.5, 2.5), "size": (6, 7), "half_width": 0.5}
 """Most of its picture is ground."""
 
 
-def on_ground(
-    density: Tensor, height: float = HEIGHT, albedo: tuple[float, ...] = ALBEDO, **scene: Any
-) -> Scene:
+def on_ground(density, height=HEIGHT, albedo=ALBEDO, **scene):
     camera = scene.pop("camera", make_camera(**VIEW))
     made = make_scene(density, camera=camera, **scene)
     return replace(made, ground=Ground(tensor(*albedo), Plane(height, 1)))
 
 
-def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
+def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky():
     scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), ambient=(0.2, 0.3, 0.5))
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
     down, up = (
@@ -91,14 +87,14 @@ def test_where_no_medium_is_near_a_ground_sends_back_its_part_of_sun_and_sky(alb
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5])
-def test_what_a_ground_hides_of_the_sky_is_not_scattered_once_either(albedo: float) -> None:
+def test_what_a_ground_hides_of_the_sky_is_not_scattered_once_either(albedo):
     """Light is followed in another way where its direction matters, even so little."""
     settings = {"directional": None, "ambient": (1.0,), "model": "none", "albedo": (albedo,)}
     even, directed = (render(on_ground(random_values(*SHAPE), g=g, **settings)) for g in (0, 1e-9))
     torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
 
 
-def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -> None:
+def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean():
     scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0, -1, 0))
     rows, columns = 8, 10
     z, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (rows, columns))
@@ -113,7 +109,7 @@ def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -
     torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-12, atol=0)
 
 
-def test_an_even_map_is_a_number() -> None:
+def test_an_even_map_is_a_number():
     scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
     known, ground = render(scene), scene.ground
     even = ground.albedo.view(3, 1, 1).expand(3, 5, 7)
@@ -121,7 +117,7 @@ def test_an_even_map_is_a_number() -> None:
     torch.testing.assert_close(found, known, rtol=1e-12, atol=0)
 
 
-def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
+def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun():
     """Its shadow has the depth of a slanted way, and all of it together is all light it takes."""
     depth, cosine = 1.3, 0.8
     grid = Grid((12, 4, 16), (-0.6, 0.0, -0.8), (0.6, 0.2, 0.8))
@@ -143,13 +139,13 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
-def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights() -> None:
+def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights():
     """Those that are less bright than its mean take away: 7 % are left of texels."""
     around = (torch.arange(16, dtype=torch.float64) + 0.5) * (2 * math.pi / 16)
     sky = light_of((1 + 0.9 * around.sin()).expand(1, 8, 16), directions=24)
     mean, lights = decompose_map(sky)
 
-    def taken(*lights: Light) -> Tensor:
+    def taken(*lights):
         black = {"sigma_a": (3.0,), "sigma_s": (0.0,), "directional": None}
         seen = []
         for density in (torch.zeros(SHAPE), torch.ones(SHAPE)):
@@ -169,7 +165,7 @@ def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["p1", "coarse", "maps"])
-def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tangent_adjoint_and_differences_agree(kind, monkeypatch):
     if kind == "coarse":
         monkeypatch.setattr(lighting, "MOST_CELLS", 4)
     model = {"transport_rounds": 1, "degree": 3}
@@ -187,7 +183,7 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
     assert_image_derivatives(scene, names, 1e-4)
 
 
-def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:
+def moved(scene, turns=0, size=1.0):
     """The same scene in other units, x, y and z taking each other's place `turns` times."""
     volume, ground, (view,) = scene.volume, scene.ground, scene.views
     assert ground is not None
@@ -212,14 +208,14 @@ def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:
 
 
 @pytest.mark.parametrize(("turns", "size"), [(0, 1e3), (1, 1.0), (2, 1.0)])
-def test_units_and_the_way_up_do_not_matter(turns: int, size: float) -> None:
+def test_units_and_the_way_up_do_not_matter(turns, size):
     scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
     found, known = render(moved(scene, turns, size)), render(scene)
     torch.testing.assert_close(found, known, rtol=1e-8, atol=1e-10)
 
 
-def test_lights_from_below_are_hidden() -> None:
+def test_lights_from_below_are_hidden():
     scene = on_ground(random_values(*SHAPE))
     known = render(scene)
     scene.lights += [DirectionalLight(tensor(0.1, 1, 0), tensor(1.0))]
@@ -227,7 +223,7 @@ def test_lights_from_below_are_hidden() -> None:
     assert torch.equal(render(scene), known)
 
 
-def test_texels_are_found_where_they_are() -> None:
+def test_texels_are_found_where_they_are():
     grid, plane = Grid(SHAPE, (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), Plane(HEIGHT, 1)
     points = texel_centers(grid, plane, tensor(0))
     texels = random_values(2, *points.shape[:2])
@@ -239,7 +235,7 @@ def test_texels_are_found_where_they_are() -> None:
 GROUND = "ground={height: -2, albedo: 0.3}"
 
 
-def test_a_map_is_read_as_it_is(tmp_path: Path) -> None:
+def test_a_map_is_read_as_it_is(tmp_path):
     gray = random_values(4, 6).float().numpy()
     for name, factor in (("a.npy", 1), ("b.npy", 2)):
         np.save(tmp_path / name, factor * gray)

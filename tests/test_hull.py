@@ -33,7 +33,7 @@ FAULTS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], list[str]]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_box_that_is_off_is_doubted_and_a_better_one_named(fault: str) -> None:
+def test_a_box_that_is_off_is_doubted_and_a_better_one_named(fault):
     change, words = FAULTS[fault]
     shown = change(SMOKE)
     doubt = doubt_box(shown, BOX)
@@ -45,13 +45,13 @@ def test_a_box_that_is_off_is_doubted_and_a_better_one_named(fault: str) -> None
 CENTER = (0.1, -0.2, 0.3)
 
 
-def looking(origin: tuple[float, float, float], up: tuple[float, float, float]) -> Camera:
+def looking(origin, up):
     vectors = (torch.tensor(vector, dtype=torch.float64) for vector in (origin, CENTER, up))
     return Camera(look_at(*vectors), (4, 5), 0.3)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
+def test_a_turn_is_rigid_about_the_line_through_the_center(axis):
     camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 0.7
     moved = turn_camera(camera, axis, angle, CENTER)
     change = moved.pose[:, :3] @ camera.pose[:, :3].T
@@ -67,9 +67,7 @@ def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
 @pytest.mark.parametrize(
     ("up", "axis"), [((1.0, 0.1, 0), 0), ((0, 1.0, 0.2), 1), ((0.2, 0, -1.0), 2)]
 )
-def test_the_upright_axis_is_the_scenes_or_the_one_the_cameras_agree_on(
-    up: tuple[float, float, float], axis: int
-) -> None:
+def test_the_upright_axis_is_the_scenes_or_the_one_the_cameras_agree_on(up, axis):
     origins = [(3.0, 0.4, 2.0), (-2.0, 0.3, 3.0), (-2.5, 3.0, -2.0)]
     scene = make_scene(random_values(4, 5, 6))
     scene.views = [View("view", looking(origin, up)) for origin in origins]
@@ -78,7 +76,7 @@ def test_the_upright_axis_is_the_scenes_or_the_one_the_cameras_agree_on(
         assert upright_axis(scene) == scene.up
 
 
-def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
+def test_a_ring_begins_at_its_view_and_goes_once_around():
     scene = make_scene(random_values(4, 5, 6))
     views = place_turntable(scene, scene.views[0], 8)
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
@@ -88,7 +86,7 @@ def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
     assert torch.allclose(again, views[0].camera.pose, atol=1e-14)
 
 
-def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it() -> None:
+def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it():
     density, grid = random_values(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
     sky = {"directional": None, "ambient": (1.0,)}
     scene = make_scene(density, grid=grid, **sky)

@@ -1,7 +1,5 @@
 """A refractive index inside the box: closed forms, no light lost or made, derivatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -9,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from media import assert_image_derivatives, make_camera, make_scene, random_values, tensor
-from torch import Tensor
 
 import ddrecon
 from ddrecon.cameras import Pane
@@ -17,7 +14,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.optics import face_resistance, reflectance, refract, transmitted_moments
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.transport.characteristics import Characteristic
 from ddrecon.transport.rounds import face_mirror
 from ddrecon.validate.balance import find_balance
@@ -25,17 +22,17 @@ from ddrecon.validate.balance import find_balance
 BEAM = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
 
 
-def with_index(scene: Scene, index: float) -> Scene:
+def with_index(scene, index):
     return replace(scene, volume=replace(scene.volume, index=index))
 
 
-def within(index: float, density: Tensor, **changes: Any) -> Scene:
+def within(index, density, **changes):
     """A scene of `make_scene` in a box of that `index`."""
     return with_index(make_scene(density, **changes), index)
 
 
 @pytest.mark.parametrize("n", [1.1, 1.4, 2.0])
-def test_fresnel_has_its_closed_forms(n: float) -> None:
+def test_fresnel_has_its_closed_forms(n):
     brewster, critical = n / math.hypot(1, n), math.sqrt(1 - 1 / n**2)
     cosines = torch.tensor([1.0, brewster, critical, critical / 2], dtype=torch.float64)
     polarized = ((n**2 - 1) / (n**2 + 1)) ** 2 / 2
@@ -51,7 +48,7 @@ def test_fresnel_has_its_closed_forms(n: float) -> None:
     assert float(entering) == pytest.approx(n**2 * transmitted_moments(n)[0], rel=1e-6)
 
 
-def test_a_pane_bends_light_by_snells_law() -> None:
+def test_a_pane_bends_light_by_snells_law():
     eye = torch.tensor([0.3, 2.0, -0.2], dtype=torch.float64)
     pane, point = Pane(1, 0.6, 1.4), torch.tensor([-1.5, -0.4, 0.7], dtype=torch.float64)
     way = torch.nn.functional.normalize(torch.stack(pane.bend(eye, [*(point - eye)])), dim=0)
@@ -61,7 +58,7 @@ def test_a_pane_bends_light_by_snells_law() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"g": 0.6, "transport_rounds": 2, "degree": 5}])
-def test_an_index_of_nearly_one_changes_nearly_nothing(changes: dict[str, Any]) -> None:
+def test_an_index_of_nearly_one_changes_nearly_nothing(changes):
     density, down = random_values(4, 5, 6), (0.0, -1.0, 0.0)
     one, other = (
         within(n, density, travel=down, ambient=(0.3,), **changes) for n in (1.0, 1 + 1e-9)
@@ -77,7 +74,7 @@ HOT = {"sigma_a": (2.0,), "transport_rounds": 1}
 @pytest.mark.parametrize(
     "changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}, CLEAR, HOT]
 )
-def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any]) -> None:
+def test_even_light_is_n_squared_times_as_bright_inside(changes):
     """Where nothing scatters as well, since faces reflect light; and what is as hot glows so."""
     medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "directional": None, "ambient": (0.7,)}
     camera = make_camera((0.0, 0.0, 2.5), is_perspective=False)
@@ -89,7 +86,7 @@ def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any])
     torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
 
 
-def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matters() -> None:
+def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matters():
     settings = {"directional": None, "ambient": (0.7,), "model": "none"}
     even, directed = (
         ddrecon.render(within(1.4, random_values(5, 4, 6), g=g, **settings)) for g in (0.0, 1e-9)
@@ -97,12 +94,12 @@ def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matte
     torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
 
 
-def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
+def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box():
     empty, camera = 0 * random_values(4, 5, 6), make_camera((0.9, 1.3, 2.5))
     assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
 
 
-def test_before_any_sweep_faces_send_back_the_light_that_is_at_them() -> None:
+def test_before_any_sweep_faces_send_back_the_light_that_is_at_them():
     """From cells amid the lower face along z, along all directions that leave it."""
     scene, light = within(1.4, random_values(3, 4, 5)), torch.zeros(1, 1, 3, 4, 5).double()
     mirror = face_mirror(scale_medium(scene.volume), 26)
@@ -116,7 +113,7 @@ def test_before_any_sweep_faces_send_back_the_light_that_is_at_them() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("light", ["down", "ambient", "beam"])
-def test_no_power_is_lost_or_made(light: str) -> None:
+def test_no_power_is_lost_or_made(light):
     lights: dict[str, Any] = {"travel": (0.0, -1.0, 0.0), "directional": (3.0,)}
     lights = {"directional": None, "ambient": (1.0,)} if light == "ambient" else lights
     medium = {"sigma_a": (1.0,), "sigma_s": (4.0,), "g": 0.3, "degree": 5}
@@ -132,7 +129,7 @@ def test_no_power_is_lost_or_made(light: str) -> None:
         assert report["fractions"]["reflected"] == pytest.approx(outer)
 
 
-def test_layers_reflect_and_transmit_as_by_adding_and_doubling() -> None:
+def test_layers_reflect_and_transmit_as_by_adding_and_doubling():
     iadpython = pytest.importorskip("iadpython", reason="adding and doubling is an extra (`dev`)")
     grid = Grid((1, 24, 1), (-500.0, -0.5, -500.0), (500.0, 0.5, 500.0))
     changes = {"sigma_a": (0.5,), "sigma_s": (0.5,), "g": 0.9, "grid": grid, "degree": 5}
@@ -146,7 +143,7 @@ def test_layers_reflect_and_transmit_as_by_adding_and_doubling() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rounds", [{}, {"transport_rounds": 2, "degree": 3}], ids=str)
-def test_images_have_tangent_adjoint_and_differences(rounds: dict[str, Any]) -> None:
+def test_images_have_tangent_adjoint_and_differences(rounds):
     near, far = (make_camera((0.9, 1.3, 2.5), is_perspective=is_near) for is_near in (True, False))
     density = 0.2 + random_values(4, 5, 6)
     world = within(1.4, density, ambient=(0.3,), g=0.5, **rounds)

@@ -1,7 +1,5 @@
 """What changes no picture: lights of a power of 1e-12, and how much of the box is empty."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace
@@ -19,7 +17,6 @@ from media import (
     random_values,
     tensor,
 )
-from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon import lighting
@@ -40,7 +37,6 @@ from ddrecon.light_field import fluence_of
 from ddrecon.lighting import solve_light
 from ddrecon.medium.phase import Blend, HenyeyGreenstein, Rayleigh
 from ddrecon.picture import render, view_image
-from ddrecon.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("few_directions")
 SHAPE, FAINT = (3, 4, 3), 1e-12
@@ -81,7 +77,7 @@ FEATURES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 }
 
 
-def scene_with(feature: str) -> Scene:
+def scene_with(feature):
     more, volume = FEATURES[feature]
     more = {"camera": make_camera((0.5, 1.5, 2.5)), **more}
     grid = replace(box_grid(SHAPE), periodic=more.pop("periodic", ()))
@@ -91,14 +87,14 @@ def scene_with(feature: str) -> Scene:
     return replace(scene, volume=replace(scene.volume, **volume), ground=ground)
 
 
-def faint_lights(scene: Scene) -> list[Light]:
+def faint_lights(scene):
     """All that there are in such a scene."""
     if scene.volume.grid.periodic:
         return EVERYWHERE
     return [*EVERYWHERE, BEAM, *([LAMP] if scene.volume.index == 1 else [])]
 
 
-def seen_of(scene: Scene, *parts: str) -> list[Tensor]:
+def seen_of(scene, *parts):
     """Fluence; and, of each of its `parts` of derivatives, image and slopes by density."""
     density = scene.volume.density.clone().requires_grad_()
     scene = replace(scene, volume=replace(scene.volume, density=density))
@@ -113,13 +109,13 @@ def seen_of(scene: Scene, *parts: str) -> list[Tensor]:
 
 
 @functools.cache
-def known_of(feature: str) -> list[Tensor]:
+def known_of(feature):
     return seen_of(scene_with(feature), "all", "single", "diffusion")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feature", FEATURES)
-def test_faint_lights_change_nothing(feature: str) -> None:
+def test_faint_lights_change_nothing(feature):
     scene = scene_with(feature)
     lit = seen_of(replace(scene, lights=[*scene.lights, *faint_lights(scene)]), "all")
     for found, known in zip(lit, known_of(feature), strict=False):
@@ -128,7 +124,7 @@ def test_faint_lights_change_nothing(feature: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feature", FEATURES)
-def test_halves_of_derivatives_sum_to_all_and_have_the_same_image(feature: str) -> None:
+def test_halves_of_derivatives_sum_to_all_and_have_the_same_image(feature):
     _, image, bar, one, first_bar, other, second_bar = known_of(feature)
     assert_near(one, image, 1e-12)
     assert_near(other, image, 1e-12)
@@ -171,7 +167,7 @@ LIGHTS: dict[str, dict[str, Any]] = {
 }
 
 
-def cloud(is_layer: bool) -> Tensor:
+def cloud(is_layer):
     """A smooth field, empty at both ends along z and, unless it `is_layer`, along x and y."""
     up, across = (torch.arange(n, dtype=torch.float64) for n in CLOUD[:2])
     height, hill = (
@@ -183,7 +179,7 @@ def cloud(is_layer: bool) -> Tensor:
     return density.where(density > 1e-9, 0)
 
 
-def scene_in(density: Tensor, empty: tuple[int, int, int], is_layer: bool, **kind: Any) -> Scene:
+def scene_in(density, empty, is_layer, **kind):
     """`density` with so many `empty` cells around it along z, y and x, and twice as many above."""
     ends = [(2 * cells if axis == 0 else cells, cells) for axis, cells in enumerate(empty)][::-1]
     is_map, glows, has_lamp = (kind.pop(name, False) for name in ("is_map", "glows", "has_lamp"))
@@ -219,9 +215,7 @@ CASES += [(light == "sun", light, 0.8) for light in LIGHTS]
 
 
 @pytest.mark.parametrize(("is_layer", "light", "albedo"), CASES)
-def test_a_box_with_more_empty_cells_shows_the_same(
-    is_layer: bool, light: str, albedo: float | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_box_with_more_empty_cells_shows_the_same(is_layer, light, albedo, monkeypatch):
     monkeypatch.setattr(lighting, "MOST_CELLS", 6)
     around = (8, 0, 0) if is_layer else (4, 4, 4)
     images = [

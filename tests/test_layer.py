@@ -21,7 +21,6 @@ from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight
-from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
 from ddrecon.variables.values import value_of, variable_names, with_values
@@ -38,13 +37,13 @@ FUSED = [pytest.param(name, "warp", marks=pytest.mark.slow) for name in ("densit
 
 
 @pytest.mark.parametrize(("name", "engine"), [*((name, "torch") for name in NAMES), *FUSED])
-def test_function_transforms_agree_with_backward(name: str, engine: str) -> None:
+def test_function_transforms_agree_with_backward(name, engine):
     ddrecon.use_engine(engine)
     scene = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
     value = value_of(scene, name)
     change = random_values(*value.shape, seed=1) - 0.5
 
-    def image(moved: Tensor) -> Tensor:
+    def image(moved):
         return render(with_values(scene, {name: moved}))
 
     out, tangent = torch.func.jvp(image, (value,), (change,))
@@ -55,7 +54,7 @@ def test_function_transforms_agree_with_backward(name: str, engine: str) -> None
     assert abs(one - other) <= 1e-10 * max(abs(one), abs((tangent * weight).abs().sum()) * 1e-2)
 
 
-def lit_scene() -> Scene:
+def lit_scene():
     """A glowing volume with a light of each kind, over a ground; of diffusion nothing is said."""
     scene = cloud()
     scene.diffusion = DiffusionSettings()
@@ -74,7 +73,7 @@ CHANGES: dict[str, Callable[[Tensor], object]] = {
 
 @pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_tensor_that_changed_unseen_is_as_a_new_one(change: Callable[[Tensor], object]) -> None:
+def test_a_tensor_that_changed_unseen_is_as_a_new_one(change):
     """No picture depends on what was rendered before, however a scene's numbers have changed."""
     scene = lit_scene()
     before = render(scene)
@@ -86,14 +85,14 @@ def test_a_tensor_that_changed_unseen_is_as_a_new_one(change: Callable[[Tensor],
     assert torch.equal(after, render(replace(deepcopy(scene))))
 
 
-def small_layer(dtype: torch.dtype = torch.float64, **kind: object) -> VolumeRenderer:
+def small_layer(dtype=torch.float64, **kind):
     density = random_values(*SHAPE, dtype=dtype)
     scene = make_scene(density, ambient=(0.2,), tolerance=1e-6, g=0.3, **kind)
     scene.starts["density"] = random_values(*SHAPE, dtype=dtype)
     return VolumeRenderer(scene)
 
 
-def test_the_scene_moves_with_the_layer() -> None:
+def test_the_scene_moves_with_the_layer():
     layer = small_layer()
     before = layer()
     layer.scene.volume.density.requires_grad_()
@@ -113,7 +112,7 @@ def test_the_scene_moves_with_the_layer() -> None:
 
 
 @pytest.mark.parametrize("given", [torch.bfloat16, torch.float32, torch.float64])
-def test_precision_is_the_layers_whatever_it_is_given(given: torch.dtype) -> None:
+def test_precision_is_the_layers_whatever_it_is_given(given):
     """Also under autocast, and after a call in another precision."""
     layer = small_layer(torch.float32)
     layer(density=random_values(*SHAPE))
@@ -127,7 +126,7 @@ def test_precision_is_the_layers_whatever_it_is_given(given: torch.dtype) -> Non
     assert density.grad is not None and density.grad.dtype == given
 
 
-def test_a_batch_is_its_entries_one_by_one() -> None:
+def test_a_batch_is_its_entries_one_by_one():
     """Of densities, cross sections and light directions; the derivative as well."""
     layer = small_layer()
     densities = random_values(3, *SHAPE, seed=1).requires_grad_()
@@ -164,9 +163,7 @@ BATCHES = {
 @pytest.mark.parametrize(
     ("name", "shape", "count"), [(name, *case) for name, cases in BATCHES.items() for case in cases]
 )
-def test_one_axis_more_than_a_number_may_have_is_a_batch(
-    name: str, shape: tuple[int, ...], count: int | None
-) -> None:
+def test_one_axis_more_than_a_number_may_have_is_a_batch(name, shape, count):
     value = 0.3 + 0.1 * random_values(*shape)
     images = small_layer()(values={name: value})
     alone = small_layer()(values={name: value if count is None else value[0]})
@@ -196,7 +193,7 @@ WRONG: dict[str, list[Any]] = {
 }
 
 
-def lens_layer() -> VolumeRenderer:
+def lens_layer():
     layer = small_layer()
     (view,), lens = layer.scene.views, {"lens": "opencv", "distortion": torch.zeros(6, **DOUBLE)}
     view.camera = replace(view.camera, **lens)
@@ -206,7 +203,7 @@ def lens_layer() -> VolumeRenderer:
 @pytest.mark.parametrize(
     ("name", "value"), [(name, value) for name, values in WRONG.items() for value in values]
 )
-def test_what_no_scene_file_may_say_is_refused(name: str, value: Any) -> None:
+def test_what_no_scene_file_may_say_is_refused(name, value):
     """By the layer, by name, and where a scene's own tensor was replaced."""
     layer = lens_layer()
     place = re.escape(name.replace("focal", "camera: half_width, 1 / (2 focal)"))
@@ -254,9 +251,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
 
 
 @pytest.mark.parametrize(("call", "problem"), CALLS.values(), ids=CALLS)
-def test_all_that_a_user_can_cause_is_an_error_of_ours(
-    call: Callable[[], object], problem: str
-) -> None:
+def test_all_that_a_user_can_cause_is_an_error_of_ours(call, problem):
     with pytest.raises(ddrecon.DdreconError, match=re.escape(problem)) as caught:
         call()
     assert "\n" not in str(caught.value)
@@ -294,7 +289,7 @@ RECORDS: dict[str, list[Any]] = {
 @pytest.mark.parametrize(
     ("place", "value"), [(place, value) for place, values in RECORDS.items() for value in values]
 )
-def test_no_part_of_a_scene_is_guessed(place: str, value: Any) -> None:
+def test_no_part_of_a_scene_is_guessed(place, value):
     """Of scenes made in Python as of those in files; also where one is made of another."""
     scene = lens_layer().scene
     *owners, name = place.split(".")
@@ -308,7 +303,7 @@ def test_no_part_of_a_scene_is_guessed(place: str, value: Any) -> None:
             render(wrong)
 
 
-def test_one_precision_and_a_known_view() -> None:
+def test_one_precision_and_a_known_view():
     scene = small_layer().scene
     with pytest.raises(UsageError, match="no view 'side'; the views are view"):
         render(scene, "side")
@@ -317,10 +312,10 @@ def test_one_precision_and_a_known_view() -> None:
         render(scene)
 
 
-def test_what_torch_cannot_do_is_said() -> None:
+def test_what_torch_cannot_do_is_said():
     layer, density = small_layer(), random_values(*SHAPE).requires_grad_()
 
-    def total(values: Tensor) -> Tensor:
+    def total(values):
         return layer(density=values).sum()
 
     with pytest.raises(NotImplementedError, match=r"vmap: .*VolumeRenderer takes batches, \[n, z"):
@@ -341,7 +336,7 @@ def test_what_torch_cannot_do_is_said() -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("rounds", [0, 1])
-def test_a_change_in_place_before_the_backward_pass_is_noticed(engine: str, rounds: int) -> None:
+def test_a_change_in_place_before_the_backward_pass_is_noticed(engine, rounds):
     """As autograd does: what is computed again there would be that of other numbers."""
     ddrecon.use_engine(engine)
     scene = make_scene(random_values(*SHAPE), transport_rounds=rounds)
@@ -354,10 +349,10 @@ def test_a_change_in_place_before_the_backward_pass_is_noticed(engine: str, roun
 
 
 @pytest.mark.slow
-def test_the_compiler_leaves_it_alone() -> None:
+def test_the_compiler_leaves_it_alone():
     layer, density = small_layer(), random_values(*SHAPE)
 
-    def network(strength: Tensor) -> Tensor:
+    def network(strength):
         return layer(density=density * strength).sin() * 2
 
     strength = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)

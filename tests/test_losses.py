@@ -9,12 +9,12 @@ from ddrecon.losses import HUBER, LOSSES, Target
 from ddrecon.pictures import Noise, decode, encode
 
 
-def image_loss(loss: str, image: torch.Tensor, target: torch.Tensor, mask=None, noise=None):
+def image_loss(loss, image, target, mask=None, noise=None):
     return Target.of(target, mask, loss, noise).loss_of(image)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None:
+def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss):
     image = torch.rand(3, 4, 5, dtype=torch.float64)
     target = torch.rand(3, 4, 5, dtype=torch.float64)
     assert image_loss(loss, target, target) == 0
@@ -26,13 +26,13 @@ def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None
 
 
 @pytest.mark.parametrize("loss", ["l2", "l1", "huber", "relative_l2"])
-def test_a_loss_of_radiance_grows_with_the_square_of_all_brightness(loss: str) -> None:
+def test_a_loss_of_radiance_grows_with_the_square_of_all_brightness(loss):
     image, target = torch.rand(2, 3, 4, 5, dtype=torch.float64).unbind()
     value = float(image_loss(loss, image, target))
     assert float(image_loss(loss, 7 * image, 7 * target)) == pytest.approx(49 * value, rel=1e-12)
 
 
-def test_small_errors_are_those_of_displayed_values() -> None:
+def test_small_errors_are_those_of_displayed_values():
     target = torch.linspace(0.0005, 0.99, 60, dtype=torch.float64).view(3, 4, 5)
     error = 1e-6 * torch.linspace(-1, 1, 60, dtype=torch.float64).view(3, 4, 5)
     shown = encode((target + error).numpy()) - encode(target.numpy())
@@ -41,7 +41,7 @@ def test_small_errors_are_those_of_displayed_values() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_the_derivative_at_black_is_finite_and_not_zero(loss: str) -> None:
+def test_the_derivative_at_black_is_finite_and_not_zero(loss):
     target = torch.rand(3, 4, 5)
     target[:, :2] = 0
     image = torch.zeros(3, 4, 5, requires_grad=True)
@@ -49,14 +49,14 @@ def test_the_derivative_at_black_is_finite_and_not_zero(loss: str) -> None:
     assert torch.isfinite(image.grad).all() and (image.grad[:, 2:] < 0).all()
 
 
-def test_what_is_brighter_than_a_white_pixel_of_a_display_does_not_err() -> None:
+def test_what_is_brighter_than_a_white_pixel_of_a_display_does_not_err():
     target = torch.tensor([1.0, 0.5]).expand(3, 1, 2)
     brighter = torch.tensor([3.0, 0.5]).expand(3, 1, 2)
     assert image_loss("display", brighter, target) == 0
     assert image_loss("display", target - 0.1, target) > 0
 
 
-def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
+def test_noise_counts_alike_in_dark_and_bright_pixels():
     noise = Noise(0.01, 0.002)
     for level in (0.0, 0.01, 1.0):
         target = torch.full((3, 8, 8), level, dtype=torch.float64)
@@ -64,7 +64,7 @@ def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
         assert float(image_loss("photon", target + error, target, None, noise)) == pytest.approx(1)
 
 
-def test_psnr_has_white_for_its_peak() -> None:
+def test_psnr_has_white_for_its_peak():
     """Of values, and of those that are displayed."""
     one = torch.ones(3, 8, 8)
     assert Target.of(one, None).psnr_of(one + 0.01) == pytest.approx(40, abs=1e-3)
@@ -75,7 +75,7 @@ def test_psnr_has_white_for_its_peak() -> None:
     assert found == pytest.approx(40, abs=1e-2)
 
 
-def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones() -> None:
+def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones():
     target = torch.ones(3, 4, 5, dtype=torch.float64)
     small, large, larger = (
         float(image_loss("huber", target + error, target)) for error in (0.01, 10.0, 20.0)
@@ -86,7 +86,7 @@ def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones(
     assert large == pytest.approx(HUBER**2 + 2 * HUBER * (10.0 - HUBER), rel=1e-9)
 
 
-def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
+def test_a_relative_error_counts_alike_in_dark_and_bright_pixels():
     target = torch.tensor([1.0, 100.0], dtype=torch.float64).expand(3, 1, 2)
     dark, bright = (
         1.1 * target - 0.1 * target * torch.tensor(keep) for keep in ([0.0, 1.0], [1.0, 0.0])
@@ -97,7 +97,7 @@ def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_masked_pixels_do_not_count(loss: str) -> None:
+def test_masked_pixels_do_not_count(loss):
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
     spoiled, noise = torch.where(mask > 0, target, target + 100), Noise(0.01, 0.0)
     one, other = (image_loss(loss, image, each, mask, noise) for each in (spoiled, target))
@@ -105,7 +105,7 @@ def test_masked_pixels_do_not_count(loss: str) -> None:
 
 
 @pytest.mark.parametrize("loss", ["l2", "relative_l2", "photon", "display"])
-def test_quality_within_a_mask_is_that_of_what_it_leaves(loss: str) -> None:
+def test_quality_within_a_mask_is_that_of_what_it_leaves(loss):
     """A mask that leaves a rectangle crops, whatever a lamp beside that does."""
     image, target, mask = torch.rand(3, 14, 18), torch.rand(3, 14, 18), torch.zeros(14, 18)
     left = slice(None), slice(2, 14), slice(5, 16)
@@ -120,7 +120,7 @@ def test_quality_within_a_mask_is_that_of_what_it_leaves(loss: str) -> None:
     assert float(masked.ssim_of(image)) == expected
 
 
-def test_what_counts_is_averaged() -> None:
+def test_what_counts_is_averaged():
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
     kept = mask.bool()
     expected = float(((image - target)[:, kept] ** 2).mean())
@@ -128,7 +128,7 @@ def test_what_counts_is_averaged() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(loss: str) -> None:
+def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(loss):
     target = Target.of(0.8 * random_values(3, 4, 5), random_values(4, 5, seed=1).round(), loss)
     image = target.image + 0.4 * (random_values(3, 4, 5, seed=3) - 0.5)
     weights = target.weights_at(image)

@@ -1,7 +1,5 @@
 """A volume that repeats: one period is as good as two, wherever it begins, in both engines."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -9,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from media import half_empty, make_scene, tensor
-from torch import Tensor
 from twins import assert_same, assert_transposes, differentiate, images_of, values_of
 
 from ddrecon.cameras import Camera, cast_rays, look_at
@@ -23,7 +20,7 @@ from ddrecon.light_field import fluence_of
 from ddrecon.lighting import fluence, solve_light
 from ddrecon.numerics.layout import MARGIN, unroll_along
 from ddrecon.picture import render, view_image
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.validate.balance import find_balance
 
 pytestmark = pytest.mark.usefixtures("few_directions")
@@ -40,7 +37,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def repeated(density: Tensor, shift: tuple[int, int] = (0, 0), **kind: Any) -> Scene:
+def repeated(density, shift=(0, 0), **kind):
     """A scene of cubes, periodic along z and x, seen aslant; cells and camera may be shifted."""
     shape = tuple(density.shape)
     grid = Grid(shape, (0.0, 0.0, 0.0), tuple(CELL * n for n in shape), periodic=(0, 2))
@@ -60,11 +57,11 @@ def repeated(density: Tensor, shift: tuple[int, int] = (0, 0), **kind: Any) -> S
     return scene
 
 
-def assert_near(found: Tensor, known: Tensor, close: float) -> None:
+def assert_near(found, known, close):
     assert float((found - known).norm()) <= close * float(known.norm())
 
 
-def see(scene: Scene) -> list[Tensor]:
+def see(scene):
     """What the camera shows, and one of parallel rays; and the fluence."""
     light, (view,) = solve_light(scene, SolveMemory()), scene.views
     cameras = view.camera, Camera(view.camera.pose, (6, 7), 0.7, False)
@@ -75,7 +72,7 @@ def see(scene: Scene) -> list[Tensor]:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
+def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind, engine):
     """Low light along x or z is followed from between cells: moved, it is not exactly the same."""
     use_engine(engine)
     density, settings = half_empty(*SHAPE), KINDS[kind]
@@ -92,8 +89,8 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [4, 8])
 def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_begins(
-    cells: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    cells, monkeypatch
+):
     """Moved by half a period, which is whole cells of both grids."""
     monkeypatch.setattr("ddrecon.lighting.MOST_CELLS", cells)
     shape, shift = (6, 5, 12), (3, 6)
@@ -106,7 +103,7 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
+def test_engines_tangents_and_adjoints_agree(kind, monkeypatch):
     """The tangent is along both variables; light is followed through few periods."""
     for room in ("numerics.layout", "march.samplers"):
         monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
@@ -121,7 +118,7 @@ def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.Monk
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fine angles", "white sky", "backward"])
-def test_the_balance_of_a_period_is_half_of_that_of_two(kind: str) -> None:
+def test_the_balance_of_a_period_is_half_of_that_of_two(kind):
     """Nothing leaves by its sides, and by its faces enters what falls on them."""
     density, settings = half_empty(*SHAPE), KINDS[kind]
     one = find_balance(repeated(density, **settings))
@@ -136,20 +133,18 @@ def test_the_balance_of_a_period_is_half_of_that_of_two(kind: str) -> None:
     assert abs(one["defect_percent"]) < 5
 
 
-def test_a_ground_sends_back_its_part_of_all_that_leaves_a_period_downwards() -> None:
+def test_a_ground_sends_back_its_part_of_all_that_leaves_a_period_downwards():
     one = find_balance(repeated(half_empty(2, 3, 2), **KINDS["ground"]))
     assert one["into_ground"] == pytest.approx(one["leaves"]["-y"])
     assert one["enters"]["ground"] == pytest.approx(0.5 * one["into_ground"], rel=0.06)
 
 
-def even(*shape: int) -> Tensor:
+def even(*shape):
     return torch.full(shape, 0.3, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("albedo, exchanges", [(0.05, 1), (0.2, 2), (0.3, 3)])
-def test_light_goes_to_a_dark_ground_and_back_no_more_often_than_is_seen(
-    albedo: float, exchanges: int
-) -> None:
+def test_light_goes_to_a_dark_ground_and_back_no_more_often_than_is_seen(albedo, exchanges):
     scene = repeated(half_empty(*SHAPE), **KINDS["isotropic"])
     scene = replace(scene, ground=Ground(tensor(albedo), Plane(-0.1, 1)))
     assert scene.exchanges == exchanges
@@ -161,7 +156,7 @@ def test_light_goes_to_a_dark_ground_and_back_no_more_often_than_is_seen(
 
 
 @pytest.mark.parametrize(("travel", "ground"), [(STEEP, 0), (SLANTED, 0), (SLANTED, 1)])
-def test_an_even_layer_has_one_dimension(travel: Any, ground: int):
+def test_an_even_layer_has_one_dimension(travel, ground):
     """Of whatever period; and a beam falls off by Beer's law, averaged over each cell."""
     kind = {"travel": travel, "g": 0.5, "transport_rounds": 1, "has_ground": ground}
     shapes = (2, 8, 5), (1, 8, 1), (4, 8, 3)
@@ -178,7 +173,7 @@ def test_an_even_layer_has_one_dimension(travel: Any, ground: int):
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
+def test_an_even_layer_glows_by_the_length_of_rays(is_perspective):
     """Wherever they enter a period: (1 - exp(-kappa L)) j / kappa."""
     kind = {"sigma_s": (0.0,), "directional": None, "emission": torch.ones(1, dtype=torch.float64)}
     scene = repeated(even(4, 5, 3), **kind)
@@ -212,7 +207,7 @@ def test_a_period_is_the_middle_of_many():
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 7.0, 1e3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_units_and_precision_do_not_tell_how_many_cells_a_beam_passes(unit: float, dtype: Any):
+def test_units_and_precision_do_not_tell_how_many_cells_a_beam_passes(unit, dtype):
     """It leaves the box after exactly 15 cells along y."""
     shape, sides = (6, 7, 8), (0.6, 0.8, 1.0)
     lower, upper = (tuple(sign * unit * side / 2 for side in sides) for sign in (-1, 1))

@@ -19,21 +19,21 @@ class FakeJob:
 
     title = "optimize"
 
-    def __init__(self, count: int):
+    def __init__(self, count):
         self.total, self.iteration = count, 0
 
     @property
-    def is_done(self) -> bool:
+    def is_done(self):
         return self.iteration == self.total
 
-    def step(self) -> str:
+    def step(self):
         """One more iteration, and what is said of it."""
         self.iteration += 1
         return "PSNR 41.3/31.2 dB"
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
-def test_a_bar_of_80_columns_and_a_log(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+def test_a_bar_of_80_columns_and_a_log(monkeypatch, is_terminal):
     stderr = io.StringIO()
     stderr.isatty = lambda: is_terminal  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stderr", stderr)
@@ -46,7 +46,7 @@ def test_a_bar_of_80_columns_and_a_log(monkeypatch: pytest.MonkeyPatch, is_termi
     assert is_terminal or len(states) <= 2
 
 
-def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_without_a_size_gets_progress(monkeypatch):
     """As containers and `script` open them: 0 columns, 0 rows."""
     reader, writer = pty.openpty()
     with os.fdopen(writer, "w") as terminal:

@@ -1,9 +1,7 @@
 """A record made in Python is judged by the types and limits that its fields declare."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -39,7 +37,7 @@ class Tree:
     [{}, {"count": 7}, {"size": [1, 2]}, {"steps": ()}, {"kind": "b"}, {"leaves": [Leaf("x", 1)]}],
     ids=str,
 )
-def test_what_is_declared_is_legal(changes: dict[str, Any]) -> None:
+def test_what_is_declared_is_legal(changes):
     assert not [*faults_of(replace(Tree(), **changes))]
 
 
@@ -60,7 +58,7 @@ WRONG: list[tuple[dict[str, Any], str, str]] = [
 
 
 @pytest.mark.parametrize(("changes", "key", "what"), WRONG, ids=str)
-def test_what_is_not_is_told_with_its_key(changes: dict[str, Any], key: str, what: str) -> None:
+def test_what_is_not_is_told_with_its_key(changes, key, what):
     assert [*faults_of(replace(Tree(), **changes), "tree")] == [(f"tree.{key}", what)]
 
 
@@ -72,13 +70,11 @@ def test_what_is_not_is_told_with_its_key(changes: dict[str, Any], key: str, wha
         (OptimizeSettings, "loss", LOSSES),
     ],
 )
-def test_a_scene_may_ask_for_whatever_is_in_a_table(
-    record: type, key: str, table: Iterable[object]
-) -> None:
+def test_a_scene_may_ask_for_whatever_is_in_a_table(record, key, table):
     choices = {field.name: field.metadata.get("choices") for field in fields(record)}
     assert list(choices[key]) == list(table)
 
 
 @pytest.mark.parametrize("section", [OpencvSection, FisheyeSection])
-def test_a_lens_has_its_coefficients_in_order(section: type) -> None:
+def test_a_lens_has_its_coefficients_in_order(section):
     assert LENSES[section.type] == tuple(field.name for field in fields(section))

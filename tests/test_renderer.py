@@ -12,8 +12,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.lighting import solve_light
-from ddrecon.picture import Components, render, view_components
-from ddrecon.scene import Scene, View
+from ddrecon.picture import render, view_components
+from ddrecon.scene import View
 from ddrecon.validate.gradcheck import check_parameters
 
 SHAPE = (5, 4, 6)
@@ -22,7 +22,7 @@ INSIDE = {"eye": (0.1, 0.1, 0.2), "half_width": 0.8}
 PARALLEL = {"eye": (0.4, 0.6, 2.5), "half_width": 0.7, "is_perspective": False}
 
 
-def components(scene: Scene) -> Components:
+def components(scene):
     return view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
 
 
@@ -31,9 +31,7 @@ def components(scene: Scene) -> Components:
 
 @pytest.mark.parametrize("model", ["p1", "none"])
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
-def test_components_sum_to_the_image_and_without_a_model_nothing_scatters_twice(
-    g: float, model: str
-):
+def test_components_sum_to_the_image_and_without_a_model_nothing_scatters_twice(g, model):
     scene = make_scene(half_empty(*SHAPE), g=g, model=model, **BOTH)
     parts = components(scene)
     together = parts.reduced + parts.single + parts.multiple
@@ -99,7 +97,7 @@ COLORED = [
 
 
 @pytest.mark.parametrize("colored", COLORED, ids=["light", "medium"])
-def test_each_color_is_a_gray_scene_of_its_own(colored: dict):
+def test_each_color_is_a_gray_scene_of_its_own(colored):
     density = half_empty(*SHAPE)
     image = render(make_scene(density, g=0.4, **GRAY | colored))[0]
     for c in range(3):
@@ -123,7 +121,7 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
-def test_derivatives_agree_in_both_modes_and_with_differences(configuration: str):
+def test_derivatives_agree_in_both_modes_and_with_differences(configuration):
     """With those of other scenes in `tests/test_engines.py`."""
     options = dict(CONFIGURATIONS[configuration])
     shape, camera = options.pop("shape", SHAPE), make_camera(**options.pop("view", {}))
@@ -138,7 +136,7 @@ def test_the_derivative_by_g_is_that_of_both_modes_at_zero():
     assert report["checks"][0]["modes_error"] < 1e-10
 
 
-def test_an_empty_volume_shows_the_background_as_it_is() -> None:
+def test_an_empty_volume_shows_the_background_as_it_is():
     """Whatever the camera does: a picture without the medium is such a picture."""
     scene = make_scene(half_empty(4, 5, 6), ambient=(0.3,))
     picture = torch.rand(3, *scene.views[0].camera.size, dtype=torch.float64)
@@ -149,11 +147,11 @@ def test_an_empty_volume_shows_the_background_as_it_is() -> None:
     torch.testing.assert_close(shown, picture)
 
 
-def test_a_picture_is_exposure_times_radiance_and_offset_and_what_shows_through() -> None:
+def test_a_picture_is_exposure_times_radiance_and_offset_and_what_shows_through():
     scene = make_scene(half_empty(4, 5, 6), ambient=(0.3,))
     view, zero = scene.views[0], tensor(0).view(1, 1, 1)
 
-    def picture(**response: torch.Tensor) -> torch.Tensor:
+    def picture(**response):
         return render(replace(scene, views=[replace(view, **response)]))[0]
 
     dark, bright = picture(background=zero), picture(background=zero + 1)

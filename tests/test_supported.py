@@ -14,7 +14,6 @@ from ddrecon.grid import Grid
 from ddrecon.layer import VolumeRenderer, fluence, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, PointLight
-from ddrecon.scene import Scene
 
 SHAPE = (3, 4, 5)
 PERIOD = "volume.periodic is for model p1 with scheme conservative, or none"
@@ -40,9 +39,7 @@ CASES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
 ]
 
 
-def scene_of(
-    settings: dict[str, Any], periodic: Any = (), index: float = 1.0, light: Any = None, height=None
-) -> Scene:
+def scene_of(settings, periodic=(), index=1.0, light=None, height=None):
     grid = replace(box_grid(SHAPE), periodic=periodic)
     scene = make_scene(random_values(*SHAPE), grid=grid, **settings)
     scene.volume.index = index
@@ -52,16 +49,14 @@ def scene_of(
 
 
 @pytest.mark.parametrize(("settings", "parts", "problem"), CASES)
-def test_what_a_file_may_not_say_python_may_not(
-    settings: dict[str, Any], parts: dict[str, Any], problem: str
-) -> None:
+def test_what_a_file_may_not_say_python_may_not(settings, parts, problem):
     scene = scene_of(settings, **parts)
     for call in (render, fluence, lambda scene: VolumeRenderer(scene)()):
         with pytest.raises(UsageError, match=re.escape(problem)):
             call(scene)
 
 
-def test_a_camera_below_a_ground_is_refused() -> None:
+def test_a_camera_below_a_ground_is_refused():
     scene = scene_of({}, height=-0.7)
     scene.views[0].camera.pose[1, 3] = -0.8
     with pytest.raises(UsageError, match=r"ground\.height: the camera of view 'view' is not above"):
@@ -69,12 +64,12 @@ def test_a_camera_below_a_ground_is_refused() -> None:
 
 
 @pytest.mark.parametrize("axes", [(0, 0), (0, 1, 2)])
-def test_a_grid_repeats_along_two_axes_at_most(axes: tuple[int, ...]) -> None:
+def test_a_grid_repeats_along_two_axes_at_most(axes):
     with pytest.raises(UsageError, match=r"volume\.periodic: name one axis or two"):
         Grid(SHAPE, (0.0,) * 3, (1.0,) * 3, periodic=axes)
 
 
-def test_lists_serve_as_tuples() -> None:
+def test_lists_serve_as_tuples():
     scene = make_scene(random_values(*SHAPE))
     expected = render(scene)
     grid, camera = scene.volume.grid, scene.views[0].camera

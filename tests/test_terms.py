@@ -22,7 +22,6 @@ from ddrecon.light.lights import (
 from ddrecon.lighting import fluence, solve_light
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import view_picture
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.terms import find_doubts, needed_terms, thick_terms
 
@@ -38,7 +37,7 @@ LIGHTS: dict[str, Callable[[torch.Tensor], Any]] = {
 }
 
 
-def color_part(part: str, color: torch.Tensor) -> Scene:
+def color_part(part, color):
     """A scene that is gray but for one `part`, of a `color` [1] or [3]."""
     scene = make_scene(random_values(3, 4, 3), sigma_a=(0.5,), sigma_s=(3.0,), ambient=(0.3,))
     volume, (view,) = scene.volume, scene.views
@@ -60,7 +59,7 @@ VIEW = "exposure", "offset", "background"
 
 
 @pytest.mark.parametrize("part", [*LIGHTS, *VOLUME, "ground", *VIEW])
-def test_all_is_gray_where_pictures_are(part: str) -> None:
+def test_all_is_gray_where_pictures_are(part):
     for color in (tensor(1.5), tensor(1.0, 2.0, 3.0)):
         scene = color_part(part, color)
         picture = view_picture(solve_light(scene, SolveMemory()), scene, scene.views[0])
@@ -74,16 +73,16 @@ BALL = ROOT / "configs" / "ball.yaml"
 SIDES = "volume.bounds={{min: [-{0}, -{0}, -{0}], max: [{0}, {0}, {0}]}}"
 
 
-def doubts(*overrides: str) -> list[str]:
+def doubts(*overrides):
     return find_doubts(load_scene(BALL, overrides=overrides))
 
 
 @pytest.mark.parametrize("config", ["ball", "plume", "smoke_sky"])
-def test_scenes_of_ours_are_not_doubted(config: str) -> None:
+def test_scenes_of_ours_are_not_doubted(config):
     assert find_doubts(load_scene(ROOT / "configs" / f"{config}.yaml")) == []
 
 
-def test_a_box_in_millimeters() -> None:
+def test_a_box_in_millimeters():
     """Where cameras are in meters, they stand within it; where sigma is, nothing shines through."""
     depth, inside = doubts(SIDES.format(500))
     assert "the optical depth across the box is 9.5e+03 at a density of 1" in depth
@@ -94,7 +93,7 @@ def test_a_box_in_millimeters() -> None:
 CAMERA = "{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [9, 9]}"
 
 
-def test_a_box_in_kilometers() -> None:
+def test_a_box_in_kilometers():
     """It shows nothing: too thin, and too small, though the middle pixel sees it."""
     tiny = SIDES.format(0.00005), f"views=[{{name: front, camera: {CAMERA}}}]"
     depth, small = doubts(*tiny, "volume.density=1", "optimize=null")
@@ -102,7 +101,7 @@ def test_a_box_in_kilometers() -> None:
     assert "smaller than a pixel or two to camera front" in small
 
 
-def test_thick_cells_at_the_faces() -> None:
+def test_thick_cells_at_the_faces():
     """They are told where a medium fills its box, scatters, and is coarse."""
     filled = "volume.density=1", "volume.sigma_a=1", "volume.sigma_s=89", "optimize=null"
     filled = *filled, "diffusion.refine=1"
@@ -114,13 +113,13 @@ def test_thick_cells_at_the_faces() -> None:
     assert doubts(*filled, grid.format(math.ceil(20 * size)), "diffusion.refine=3") == []
 
 
-def test_cells_that_stay_thick_are_told_what_their_thirds_change() -> None:
+def test_cells_that_stay_thick_are_told_what_their_thirds_change():
     """Of a volume that is small in all of its cells, else of those around the thickest."""
     density = random_values(5, 6, 7)
     density[2, 3, 3] = 4.0
     thick = make_scene(density, sigma_s=(12.0,), g=0.5, refine=1, transport_rounds=2)
 
-    def changes(scene: Scene) -> list[str]:
+    def changes(scene):
         return [line.split("changes by ")[1] for line in thick_terms(scene)]
 
     thirds = replace(thick, diffusion=replace(thick.diffusion, refine=3))
@@ -133,7 +132,7 @@ def test_cells_that_stay_thick_are_told_what_their_thirds_change() -> None:
     assert changes(replace(thick, volume=replace(thick.volume, density=0.01 * density))) == []
 
 
-def test_a_thick_face_is_told_by_what_it_costs() -> None:
+def test_a_thick_face_is_told_by_what_it_costs():
     """Absorption makes a depth worse, a forward peak better; tissue is told of similarity."""
     cells = "volume.density=1", "optimize=null", "volume.resolution=[10, 10, 10]"
     cells = *cells, "diffusion.refine=1"
@@ -152,7 +151,7 @@ def test_a_thick_face_is_told_by_what_it_costs() -> None:
         assert "in the same unit?" in lines[-1] and "times smaller" not in str(lines)
 
 
-def test_a_light_below_the_ground() -> None:
+def test_a_light_below_the_ground():
     ground = "ground={height: -9, albedo: 0.3}"
     below = (
         "lights=[{type: point, position: [0, -9.5, 0], intensity: 1}, {type: ambient, radiance: 1}]"

@@ -41,9 +41,7 @@ ddrecon.optimize(scene, "many")
 
 
 @pytest.mark.slow
-def test_a_type_checker_knows_right_from_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_type_checker_knows_right_from_wrong(tmp_path, monkeypatch):
     monkeypatch.setenv("MYPYPATH", str(ROOT))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "user.py").write_text(f"{RIGHT}from ddrecon.variables import values{WRONG}")
@@ -55,7 +53,7 @@ def test_a_type_checker_knows_right_from_wrong(
     assert not problem
 
 
-def test_what_it_knows_is_there() -> None:
+def test_what_it_knows_is_there():
     """The names that are imported for it alone, and those that are imported when first used."""
     text = Path(ddrecon.__file__).read_text(encoding="utf-8")
     names = re.findall(r"^    from \S+ import (\w+) as \1$", text, re.M)

@@ -1,21 +1,17 @@
 """Commands on a small scene in a folder of its own, run in this process."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
 from small_scene import contents
-
-Run = Callable[..., Result]
 
 
 @pytest.fixture
-def succeed(run: Run) -> Run:
+def succeed(run):
     """Runs a command that must exit with 0."""
 
-    def run_well(*arguments: str) -> Result:
+    def run_well(*arguments):
         result = run(*arguments)
         assert result.exit_code == 0, result.stderr
         return result
@@ -24,10 +20,10 @@ def succeed(run: Run) -> Run:
 
 
 @pytest.fixture
-def refuse(run: Run, folder: Path) -> Callable[..., list[str]]:
+def refuse(run, folder):
     """The lines on stderr of a command that must exit with `code`, and print and write nothing."""
 
-    def run_badly(code: int, *arguments: str) -> list[str]:
+    def run_badly(code, *arguments):
         before = contents(folder)
         result = run(*arguments)
         assert (result.exit_code, result.stdout) == (code, ""), result.output
@@ -38,10 +34,10 @@ def refuse(run: Run, folder: Path) -> Callable[..., list[str]]:
 
 
 @pytest.fixture
-def density_of() -> Callable[[str], np.ndarray]:
+def density_of():
     """The density in the folder of a run."""
 
-    def read(run_folder: str) -> np.ndarray:
+    def read(run_folder):
         with np.load(Path(run_folder) / "volumes" / "density.npz", allow_pickle=False) as archive:
             return archive["density"]
 

@@ -1,15 +1,11 @@
 """`volume: {bounds: auto, resolution: auto}`: what pictures leave room for, in numbers."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from click.testing import Result
 
 from ddrecon.cameras import cast_rays, pixel_width
 from ddrecon.scene_file.build import load_scene
@@ -32,12 +28,10 @@ PLACES = ((0, 0.3, 2.5), (-2.2, 0.9, 1.0), (2.3, 0.1, 0.5))
 
 
 @pytest.fixture
-def scene(folder: Path) -> Callable[..., Path]:
+def scene(folder):
     """Writes a film of a ball in two places, before what pictures show without it."""
 
-    def write(
-        lens: str = "pinhole", behind: float = 0, ball: float = 0.5, more: str = "", radius=RADIUS
-    ) -> Path:
+    def write(lens="pinhole", behind=0, ball=0.5, more="", radius=RADIUS):
         views = [
             f"  - {{name: v{i}, image: 'v{i}_{{frame}}.npy', {more} camera: {{{LENSES[lens]}, "
             f"origin: {list(place)}, target: [0, 0.3, 0], resolution: [90, 70]}}}}"
@@ -65,7 +59,7 @@ def scene(folder: Path) -> Callable[..., Path]:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], lens: str) -> None:
+def test_a_box_holds_what_is_seen_and_little_more(scene, lens):
     """In all frames; and scenes with what was found are as any."""
     path = scene(lens)
     found = read_scene(path)
@@ -85,9 +79,7 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
 
 
 @pytest.mark.parametrize("periodic", [False, True])
-def test_cells_of_a_box_in_numbers_are_cubes_but_for_its_period(
-    scene: Callable[..., Path], periodic: bool
-) -> None:
+def test_cells_of_a_box_in_numbers_are_cubes_but_for_its_period(scene, periodic):
     """The box keeps its lower corner, and grows by less than a cell."""
     low, high = np.array([-1.0, -0.9, -0.8]), np.array([1.0, 1.13, 0.97])
     box = f"{{min: {low.tolist()}, max: {high.tolist()}}}"
@@ -106,9 +98,7 @@ def test_cells_of_a_box_in_numbers_are_cubes_but_for_its_period(
     )
 
 
-def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
-    scene: Callable[..., Path], run: Callable[..., Result]
-) -> None:
+def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(scene, run):
     bright = read_scene(scene()).tree.volume
     dark = scene(behind=0.9, ball=0.4, more="background: 0.9,")
     assert read_scene(dark).tree.volume == bright
@@ -134,17 +124,13 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
         ({}, ["frames.last=2"], "does not exist"),
     ],
 )
-def test_what_pictures_do_not_tell_is_asked_for(
-    scene: Callable[..., Path], refuse, make: dict[str, float], overrides: list[str], line: str
-) -> None:
+def test_what_pictures_do_not_tell_is_asked_for(scene, refuse, make, overrides, line):
     scene(**make)
     (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))
     assert line in told
 
 
-def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
-    scene: Callable[..., Path], run: Callable[..., Result], refuse
-) -> None:
+def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(scene, run, refuse):
     """By `check` and, where the support is asked for, before anything is optimized."""
     box = "volume.bounds={{min: [{0}, 0, {0}], max: [{1}, 1, {1}]}}"
     scene()
@@ -164,9 +150,7 @@ def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
     assert told.exit_code == 0 and "volume.bounds: far too large" in told.stderr
 
 
-def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
-    scene: Callable[..., Path], run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_far_wider_than_pixels_and_far_too_many_are_told(scene, run, monkeypatch):
     """With how many pixels a run averages; `auto` takes wider ones."""
     scene()
     told = run("check", "auto.yaml", "-D", "volume.resolution=[3, 3, 3]").stdout

@@ -4,21 +4,16 @@ import gc
 import json
 import re
 import weakref
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import torch
-from click.testing import Result
 from small_scene import contents
 
-from ddrecon import Scene, load_scene
+from ddrecon import load_scene
 from ddrecon.cli.check import supports_of
 
-Run = Callable[..., Result]
 
-
-def test_grid_views_physics_memory_and_time(succeed: Run, folder: Path) -> None:
+def test_grid_views_physics_memory_and_time(succeed, folder):
     before = contents(folder)
     lines = succeed("check", "scene.yaml").stdout.splitlines()
     assert lines[0].startswith("grid: 6 x 5 x 4 cells of 0.1667 x 0.2 x 0.25")
@@ -60,16 +55,14 @@ PHYSICS = [
 
 
 @pytest.mark.parametrize(("override", "present", "absent"), PHYSICS)
-def test_only_the_physics_a_scene_needs(
-    succeed: Run, override: str, present: str, absent: str
-) -> None:
+def test_only_the_physics_a_scene_needs(succeed, override, present, absent):
     overrides = ["-D", "diffusion.transport_rounds=null", "-D", override]
     result = succeed("check", "scene.yaml", "--json", *overrides)
     physics = "\n".join(json.loads(result.stdout)["physics"])
     assert present in physics and absent not in physics
 
 
-def test_every_command_tells_the_same_doubts(succeed: Run) -> None:
+def test_every_command_tells_the_same_doubts(succeed):
     """Each once, on stderr, whatever is printed."""
     thick = "-D", "volume.sigma_s=300", "-D", "optimize.parameters.density.init=1"
     succeed("optimize", "scene.yaml", "-o", "run", *thick)
@@ -83,11 +76,11 @@ def test_every_command_tells_the_same_doubts(succeed: Run) -> None:
         assert succeed(*command).stderr.splitlines().count(told) == 1
 
 
-def test_no_pictures_of_a_film_are_kept_but_the_first(folder: Path) -> None:
+def test_no_pictures_of_a_film_are_kept_but_the_first(folder):
     """But what they show."""
     pictures = list[weakref.ref[torch.Tensor]]()
 
-    def frames() -> Iterator[Scene]:
+    def frames():
         for _ in range(3):
             scene = load_scene(folder / "scene.yaml")
             pictures.extend(weakref.ref(v.image) for v in scene.views if v.image is not None)

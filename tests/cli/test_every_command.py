@@ -7,15 +7,13 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 
 from ddrecon import __version__, engine
 from ddrecon.cli import check
@@ -24,12 +22,9 @@ from ddrecon.cli.session import Session
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.images.oiio import write_exr
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
-
 
 @pytest.mark.parametrize("command", main.commands)
-def test_a_command_says_what_it_does(command: str) -> None:
+def test_a_command_says_what_it_does(command):
     result = CliRunner().invoke(main, [command, "--help"])
     assert result.exit_code == 0
     assert main.commands[command].help.splitlines()[0] in " ".join(result.stdout.split())
@@ -73,7 +68,7 @@ for code, *command in {CALLS!r}:
 """
 
 
-def test_help_and_errors_of_a_scene_file_are_told_at_once(folder: Path) -> None:
+def test_help_and_errors_of_a_scene_file_are_told_at_once(folder):
     """Torch and numpy are not loaded to say so."""
     Path("wrong.yaml").write_text(SCENE)
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
@@ -81,7 +76,7 @@ def test_help_and_errors_of_a_scene_file_are_told_at_once(folder: Path) -> None:
     assert done.stdout.splitlines() == [f"{code} True" for code, *_ in CALLS]
 
 
-def test_a_volume_is_described_without_torch(folder: Path) -> None:
+def test_a_volume_is_described_without_torch(folder):
     """Which takes seconds to load."""
     np.savez("a.npz", density=np.ones((2, 2, 2)))
     said = "from ddrecon.cli.commands import main; main(['info', 'a.npz'], standalone_mode=False)"
@@ -91,7 +86,7 @@ def test_a_volume_is_described_without_torch(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("argument", ["--help", "--version"])
-def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
+def test_results_that_cannot_be_written_are_one_line(argument):
     command = [sys.executable, "-m", "ddrecon", argument]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
@@ -99,7 +94,7 @@ def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
     assert (done.returncode, done.stderr) == (3, line)
 
 
-def test_threads_are_no_more_than_cores_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_are_no_more_than_cores_that_may_be_used(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})
     session = Session()
@@ -108,7 +103,7 @@ def test_threads_are_no_more_than_cores_that_may_be_used(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("command", [["check", "-D", "optimize=null"], ["info"]])
-def test_json_prints_what_it_would_write(succeed: Run, command: list[str]) -> None:
+def test_json_prints_what_it_would_write(succeed, command):
     """And takes no scene for a file to write; nothing is optimized, as times differ."""
     scene = Path("scene.yaml").read_text()
     printed = succeed(*command, "--json", "scene.yaml").stdout
@@ -121,7 +116,7 @@ def test_json_prints_what_it_would_write(succeed: Run, command: list[str]) -> No
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def installed(monkeypatch):
     """warp-lang 9.8.7 is installed, and taken unless another engine is asked for."""
     monkeypatch.setattr(engine, "find_spec", {"warp": "found"}.get)
     monkeypatch.setattr(metadata, "version", {"warp-lang": "9.8.7", "torch": "1.2"}.get)
@@ -129,7 +124,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_the_engine_that_computes_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_engine_that_computes_is_told(run, monkeypatch):
     python = ".".join(map(str, sys.version_info[:3]))
     (line,) = run("--version").stdout.splitlines()
     versions = f"ddrecon {__version__}, Python {python}, torch 1.2, engine warp (warp-lang 9.8.7)"
@@ -144,9 +139,7 @@ def test_the_engine_that_computes_is_told(run: Run, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("installed")
-def test_an_engine_that_cannot_be_is_refused(
-    refuse: Refuse, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_engine_that_cannot_be_is_refused(refuse, succeed, monkeypatch):
     monkeypatch.setattr(engine, "find_spec", {}.get)
     command = "check", "scene.yaml", "--engine"
     texts = succeed(*command, "auto").stderr, succeed(*command, "torch").stderr
@@ -163,12 +156,10 @@ def test_an_engine_that_cannot_be_is_refused(
 
 
 @pytest.mark.parametrize(("quiet", "count"), [((), 1), (("-q",), 0)])
-def test_a_compilation_is_announced_once(
-    succeed: Run, monkeypatch: pytest.MonkeyPatch, quiet: tuple[str, ...], count: int
-) -> None:
+def test_a_compilation_is_announced_once(succeed, monkeypatch, quiet, count):
     describe = check.describe
 
-    def compile_and_describe(*scene: Any) -> object:
+    def compile_and_describe(*scene):
         logging.getLogger("ddrecon.engine").warning("compiling")
         return describe(*scene)
 
@@ -205,17 +196,17 @@ load._text = read
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_an_interrupt_is_one_line_and_code_130(folder: Path, moment: str) -> None:
+def test_an_interrupt_is_one_line_and_code_130(folder, moment):
     command = [sys.executable, "-c", PRESS + MOMENTS[moment]]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-def test_other_threads_are_not_interrupted() -> None:
+def test_other_threads_are_not_interrupted():
     """As of whoever iterates over `optimize_sequence` in one: there are no signals there."""
     asked = list[list[int]]()
 
-    def work() -> None:
+    def work():
         with defer_interrupt() as numbers:
             asked.append(numbers)
 
@@ -235,9 +226,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("command", NAMED)
-def test_names_that_are_no_utf8_are_used_or_refused(
-    folder: Path, refuse: Refuse, command: str
-) -> None:
+def test_names_that_are_no_utf8_are_used_or_refused(folder, refuse, command):
     shutil.copytree(folder, folder / STRANGE)
     if ".exr" in command:
         pytest.importorskip("OpenImageIO")

@@ -1,23 +1,18 @@
 """What `ddrecon export` writes, and what `ddrecon info` says of volumes and images."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import openvdb_python
 import pytest
-from click.testing import Result
 from small_scene import contents
 
 from ddrecon.io.volumes.table import field_names, read_field, write_field
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
 
-
-def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
+def test_a_scene_becomes_xml_and_a_volume(succeed):
     before = set(contents(Path()))
     result = succeed("export", "scene.yaml", "-o", "smoke.xml")
     assert set(contents(Path())) - before == {"smoke.xml", "smoke.sigma_t.vol"}
@@ -28,7 +23,7 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert kinds == {"directional", "constant"}
 
 
-def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
+def test_a_scenes_cameras_become_transforms(succeed):
     said = succeed("export", "scene.yaml", "-o", "transforms.json").stdout
     assert said == "written: transforms.json\n"
     frames = json.loads(Path("transforms.json").read_text())["frames"]
@@ -41,7 +36,7 @@ def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".vdb"])
-def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
+def test_fields_of_several_files_go_into_one(succeed, suffix):
     values = np.random.default_rng(1).random((4, 5, 6, 3)).astype(np.float32)
     write_field(Path("smoke.albedo.vol"), "albedo", values, np.array([[-0.5] * 3, [0.5] * 3]))
     succeed("export", "density.npz", "smoke.albedo.vol", "-o", f"both{suffix}")
@@ -51,7 +46,7 @@ def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
         assert np.array_equal(both.values, known.values)
 
 
-def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
+def test_volumes_that_do_not_go_together(refuse, succeed):
     box = np.array([[-0.5] * 3, [0.5] * 3])
     write_field(Path("other.npz"), "albedo", np.ones((4, 5, 7)), box)
     write_field(Path("moved.npz"), "albedo", np.ones((4, 5, 6)), 2 * box)
@@ -72,7 +67,7 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
     succeed("export", "density.npz", "-o", "two.vdb", "--overwrite")
 
 
-def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
+def test_a_run_is_exported_as_it_stands(succeed, refuse):
     """What differs by cell as fields; the rest is printed."""
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
     constants = "sigma_t 6.5 5.5 4.5, albedo 0.923077 0.909091 0.888889, g 0.3"
@@ -99,7 +94,7 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
 
 
 @pytest.mark.parametrize(("name", "colors"), [("g", ()), ("albedo", (3,)), ("velocity", (3,))])
-def test_z_points_up_where_y_did(succeed: Run, name: str, colors: tuple[int, ...]) -> None:
+def test_z_points_up_where_y_did(succeed, name, colors):
     """Each cell keeps its place in space: (x, y, z) becomes (x, -z, y). So do arrows."""
     values = np.random.default_rng(2).random((2, 3, 4, *colors)).astype(np.float32)
     box = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 5.0]])
@@ -120,9 +115,7 @@ def test_z_points_up_where_y_did(succeed: Run, name: str, colors: tuple[int, ...
     ("before", "after", "is_same"),
     [("z", "z", True), ("y", "y", True), ("z", "y", False), ("x", "z", False)],
 )
-def test_a_scene_is_turned_from_its_own_way_up(
-    succeed: Run, before: str, after: str, is_same: bool
-) -> None:
+def test_a_scene_is_turned_from_its_own_way_up(succeed, before, after, is_same):
     """A column along its way up is one along the way up of the file, as high as before."""
     column = np.zeros((5, 5, 5), np.float32)
     box = np.array([[-1.0] * 3, [1.0] * 3])
@@ -143,13 +136,13 @@ def test_a_scene_is_turned_from_its_own_way_up(
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 1.0, 1.0]])
 
 
-def colored() -> np.ndarray:
+def colored():
     values = np.zeros((2, 3, 4, 3))
     values[0, 0] = [0.5, 1.0, 0.0]
     return values
 
 
-def test_a_volume(succeed: Run, suffix: str) -> None:
+def test_a_volume(succeed, suffix):
     write_field(Path(f"smoke.albedo{suffix}"), "albedo", colored(), BOUNDS)
     cells, albedo, *more = succeed("info", f"smoke.albedo{suffix}").stdout.splitlines()
     box = "from [-1.0, -2.0, -3.0] to [1.0, 1.0, 1.0]"
@@ -158,7 +151,7 @@ def test_a_volume(succeed: Run, suffix: str) -> None:
     assert more == ["  metadata: class fog volume"] * (suffix == ".vdb")
 
 
-def test_what_is_no_field_of_the_same_cells_is_named(succeed: Run, refuse: Refuse) -> None:
+def test_what_is_no_field_of_the_same_cells_is_named(succeed, refuse):
     """And left out of an export, with a warning; a file of nothing else is refused."""
     others = {"origin": np.zeros(3), "finer": np.ones((4, 4, 4))}
     np.savez("all.npz", density=np.ones((2, 2, 2)), bounds=BOUNDS, **others)
@@ -178,7 +171,7 @@ def test_what_is_no_field_of_the_same_cells_is_named(succeed: Run, refuse: Refus
     assert "origin has shape [3]" in refuse(3, "info", "none.npz")[-1]
 
 
-def test_a_haze_counts_as_empty(succeed: Run) -> None:
+def test_a_haze_counts_as_empty(succeed):
     """Of less than a ten thousandth of the largest, as an optimization leaves it."""
     haze = np.geomspace(1e-19, 0.9e-4, 24).reshape(2, 3, 4)
     haze[0, 0, :2] = 1, 1.1e-4
@@ -186,7 +179,7 @@ def test_a_haze_counts_as_empty(succeed: Run) -> None:
     assert "more than 0.0001 of the largest in 8.33 %" in succeed("info", "smoke.npz").stdout
 
 
-def test_the_volume_of_a_scene(succeed: Run) -> None:
+def test_the_volume_of_a_scene(succeed):
     """Its fields as their file has them, and what is the same everywhere."""
     override = ["-D", "volume.density={file: density.npz}"]
     report = json.loads(succeed("info", "density.npz", "--json").stdout)
@@ -199,7 +192,7 @@ def test_the_volume_of_a_scene(succeed: Run) -> None:
     assert all(line.endswith(" everywhere") for line in lines[2:])
 
 
-def test_an_image(succeed: Run) -> None:
+def test_an_image(succeed):
     np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
     line = "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
     assert succeed("info", "picture.npy").stdout == line

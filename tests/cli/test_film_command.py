@@ -6,18 +6,16 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import chdir
 from itertools import chain, product
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import openvdb_python
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from small_scene import contents
 
 import ddrecon
@@ -33,8 +31,6 @@ from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.build_views import at_frame
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
 FRAMES = 4
 VIEWS = {"front": [0, 0, 2.5], "left": [-2.2, 0.2, 1.0], "side": [2.5, 0, 0]}
 SCENE = """\
@@ -56,7 +52,7 @@ SCATTERED = "diffusion={transport_rounds: 0}"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """A folder with film.yaml and the pictures of a ball that moves."""
     folder = tmp_path_factory.mktemp("film")
     lines = [
@@ -81,13 +77,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def film(made: Path, folder: Path) -> Path:
+def film(made, folder):
     """The current folder, with what is in the one that was made."""
     return Path(shutil.copytree(made, folder, dirs_exist_ok=True))
 
 
 @pytest.fixture(scope="module")
-def whole(made: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def whole(made, tmp_path_factory):
     """The folder of the film's run, left alone from beginning to end; the film is beside it."""
     folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("whole"), dirs_exist_ok=True))
     with chdir(folder):
@@ -99,7 +95,7 @@ FEW = "-D", "optimize.iterations=6"
 ALONE = *FEW, "-D", "frames.calibrate=0"
 
 
-def volumes(folder: str) -> dict[str, bytes]:
+def volumes(folder):
     """The arrays of all volumes in the folder of a film, by file."""
     return {
         str(path.relative_to(folder)): b"".join(
@@ -109,11 +105,11 @@ def volumes(folder: str) -> dict[str, bytes]:
     }
 
 
-def optimize(*arguments: str) -> tuple[str, ...]:
+def optimize(*arguments):
     return ("optimize", "film.yaml", *arguments, "-q", "--dtype", "float64")
 
 
-def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> None:
+def test_a_film_is_runs_in_a_sequence(whole, film, succeed):
     out = Path(whole)
     record = json.loads((out / "film.json").read_text())
     assert [row["frame"] for row in record["frames"]] == list(range(FRAMES))
@@ -153,7 +149,7 @@ def test_a_film_is_runs_in_a_sequence(whole: str, film: Path, succeed: Run) -> N
     assert sorted(path.name for path in Path("other/frames").iterdir()) == ["0002", "0003"]
 
 
-def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed: Run) -> None:
+def test_a_still_film_without_calibration_is_the_single_run(film, succeed):
     for name in VIEWS:
         np.save(f"{name}_01.npy", np.load(f"{name}_00.npy"))
     succeed(*optimize("-o", "out", "--frames", "0:1", *ALONE))
@@ -167,7 +163,7 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
 
 
 @pytest.mark.slow
-def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
+def test_a_frame_keeps_a_part_of_its_start(whole, succeed):
     frame = Path(whole) / "frames/0002"
     given = "-q", "--dtype", "float64", "-D", "optimize.keep_start=0"
     succeed("optimize", str(frame / "scene.yaml"), "-o", "bare", *given)
@@ -179,7 +175,7 @@ def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
     np.testing.assert_allclose(kept, (1 - MIXED) * bare + MIXED * start, atol=1e-6)
 
 
-def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
+def test_a_part_far_from_others_knows_nothing_of_them(film, succeed):
     """It begins from nothing, and its first frame moves as the second does."""
     for name in VIEWS:
         for number in range(4, 10):
@@ -196,17 +192,17 @@ def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) 
 
 
 @pytest.fixture
-def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+def killed_at(monkeypatch):
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e9)
     advance, count = Reconstruction.advance, iter(range(10**6))
 
-    def arm(last: int) -> None:
+    def arm(last):
         nonlocal count
         count = iter(range(last))
 
-    def counted(run: Reconstruction) -> Any:
+    def counted(run):
         if next(count, None) is None:
             raise SystemExit(9)
         return advance(run)
@@ -216,9 +212,7 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 @pytest.mark.slow
-def test_killed_anywhere_and_in_parts_to_the_same_bits(
-    whole: str, film: Path, succeed: Run, run: Run, killed_at: Callable[[int], None]
-) -> None:
+def test_killed_anywhere_and_in_parts_to_the_same_bits(whole, film, succeed, run, killed_at):
     """In the calibration, amid a frame, and again."""
     first = optimize("-o", "parts", "--resume", "--frames", "0:1")
     for last in (3, 14, 5, 3):
@@ -237,7 +231,7 @@ def test_killed_anywhere_and_in_parts_to_the_same_bits(
 
 
 @pytest.mark.slow
-def test_ranks_share_out_the_frames_and_calibrate_once(film: Path) -> None:
+def test_ranks_share_out_the_frames_and_calibrate_once(film):
     """The second waits, and takes what the first has found; the last to end knows of all."""
     job = {"ranks": 2, "arguments": optimize("-o", "out", *FEW)}
     script = Path(__file__).parents[1] / "ranks/forked.py"
@@ -251,7 +245,7 @@ def test_ranks_share_out_the_frames_and_calibrate_once(film: Path) -> None:
     assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
 
 
-def test_ranks_share_out_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranks_share_out_all_frames(monkeypatch):
     for frames, count in product(range(1, 6), range(1, 8)):
         monkeypatch.setattr("ddrecon.film.rank_count", lambda count=count: count)
         shares = []
@@ -262,7 +256,7 @@ def test_ranks_share_out_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
         assert max(map(len, shares)) == -(-frames // count)
 
 
-def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:
+def test_frames_of_films_are_those_of_pictures(film, refuse):
     """Each camera by its own count; a scene says which frame is its, and is read again as such."""
     pytest.importorskip("imageio_ffmpeg", reason="films are an extra")
     text = Path("film.yaml").read_text()
@@ -290,7 +284,7 @@ def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> No
 
 
 @pytest.mark.slow
-def test_from_python(whole: str, film: Path) -> None:
+def test_from_python(whole, film):
     sizes = ["frames.last=1", "frames.calibrate=0", "optimize.iterations=6"]
     found = list(ddrecon.optimize_sequence("film.yaml", overrides=sizes, dtype=torch.float64))
     assert all(1 <= len(result.rows) <= 6 for result in found)
@@ -303,7 +297,7 @@ def test_from_python(whole: str, film: Path) -> None:
         next(ddrecon.optimize_sequence("scene.yaml"))
 
 
-def test_a_frame_that_fails_is_named_and_left_to_a_resume(film: Path, run: Run) -> None:
+def test_a_frame_that_fails_is_named_and_left_to_a_resume(film, run):
     Path("front_01.npy").write_bytes(b"broken")
     first = run(*optimize("-o", "out", *FEW))
     assert first.exit_code == 3
@@ -334,7 +328,7 @@ MISUSE = """
 
 
 @pytest.mark.parametrize("row", MISUSE.strip().splitlines())
-def test_misuse_is_one_line(film: Path, run: Run, row: str) -> None:
+def test_misuse_is_one_line(film, run, row):
     arguments, _, words = row.partition(" => ")
     Path("strange.json").write_text('{"values": {"views.top.exposure": 1.0}}')
     result = run(*optimize("-o", "out", *arguments.replace("e:{", "e: {").split(" ", 1)))
@@ -342,7 +336,7 @@ def test_misuse_is_one_line(film: Path, run: Run, row: str) -> None:
     assert words in result.stderr.splitlines()[0]
 
 
-def test_misuse_of_folders(whole: str, film: Path, succeed: Run, refuse: Refuse) -> None:
+def test_misuse_of_folders(whole, film, succeed, refuse):
     """Parts of a film are those of films, of the same film, and of its frames."""
     shutil.copytree(whole, "whole")
     assert "not empty" in refuse(2, *optimize("-o", "whole"))[0]
@@ -359,7 +353,7 @@ def test_misuse_of_folders(whole: str, film: Path, succeed: Run, refuse: Refuse)
     assert Path("whole/sequence/film_0000.vdb").is_file()
 
 
-def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, succeed: Run) -> None:
+def test_a_sequence_is_turned_and_moves_by_the_second(film, whole, succeed):
     """Arrows turn as places do, and go as far in a second as in all of its frames."""
     shutil.copytree(whole, "whole")
     again = "optimize", f"{whole}/scene.yaml", "-o", "whole", "--resume", "--dtype", "float64"
@@ -380,9 +374,7 @@ def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, su
     assert fps == 25 and "velocity [u/s]" in units
 
 
-def test_a_part_done_anew_leaves_all_else(
-    film: Path, run: Run, succeed: Run, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_done_anew_leaves_all_else(film, run, succeed, refuse, monkeypatch):
     """And nothing is touched while another process is there, or where it is another film."""
     succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *ALONE))
     before, places = contents(film / "out"), ("frames/0000", "frames/0001")
@@ -397,7 +389,7 @@ def test_a_part_done_anew_leaves_all_else(
     redo = optimize("-o", "out", "--frames", "1:1", "--overwrite", *ALONE)
     advance = Reconstruction.advance
 
-    def advance_locked(run: Reconstruction) -> Any:
+    def advance_locked(run):
         with pytest.raises(UsageError, match="is writing there"), hold(Path("out", LOCK)):
             pass
         return advance(run)
@@ -425,7 +417,7 @@ def test_a_part_done_anew_leaves_all_else(
     assert not [*Path("out").rglob("checkpoints/previous.pt")]
 
 
-def test_frames_are_spread_over_all() -> None:
+def test_frames_are_spread_over_all():
     for count in range(2, 9):
         found = spread_out(range(3, 40, 2), count)
         assert len(set(found)) == count and (found[0], found[-1]) == (3, 39)

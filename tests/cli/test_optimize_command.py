@@ -6,15 +6,12 @@ import math
 import re
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from click.testing import Result
 from small_scene import contents
 
 from ddrecon.errors import UsageError
@@ -24,25 +21,22 @@ from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.search import Search
 from ddrecon.run import job, quality
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
-DensityOf = Callable[[str], np.ndarray]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
 FINER = ["-D", "volume.resolution=[16, 8, 8]"]
 COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr"]
 COLUMNS += ["forward_iterations", "adjoint_iterations"]
 
 
-def rows(folder: str) -> list[dict[str, str]]:
+def rows(folder):
     with Path(folder, "loss.csv").open(newline="") as stream:
         return list(csv.DictReader(stream))
 
 
-def column(folder: str, name: str) -> list[int]:
+def column(folder, name):
     return [int(row[name]) for row in rows(folder)]
 
 
-def read_json(path: str) -> Any:
+def read_json(path):
     return json.loads(Path(path).read_text())
 
 
@@ -54,7 +48,7 @@ previews/front.000002.png previews/side.000002.png previews/density.slices.00000
 previews/front.000004.png previews/side.000004.png"""
 
 
-def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
+def test_what_a_run_writes(succeed, density_of):
     exact = "-D", "diffusion.tolerance=1e-6", "-D", "render.steps_per_voxel=1"
     values = {"threads": 1, "seed": 7, "device": "cpu"}
     options = [word for name, value in values.items() for word in (f"--{name}", str(value))]
@@ -106,9 +100,7 @@ def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     assert all(words in text for words in [*shown, "fluxes Q1 and L1", "torch"])
 
 
-def test_the_resolved_scene_runs_again_to_the_same_bits(
-    succeed: Run, density_of: DensityOf
-) -> None:
+def test_the_resolved_scene_runs_again_to_the_same_bits(succeed, density_of):
     succeed(*OPTIMIZE, "out", "-D", "volume.g=0.1", "--iterations", "3")
     Path("elsewhere").mkdir()
     scene = Path("out/scene.yaml").rename("elsewhere/scene.yaml")
@@ -117,7 +109,7 @@ def test_the_resolved_scene_runs_again_to_the_same_bits(
     assert scene.read_text() == Path("again/scene.yaml").read_text()
 
 
-def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
+def test_overwrite_starts_afresh(succeed, density_of):
     """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
@@ -131,13 +123,11 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     assert all(Path("out", name).read_text() == Path(name).name for name in names)
 
 
-def test_overwriting_keeps_what_the_new_run_reads(
-    run: Run, succeed: Run, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_overwriting_keeps_what_the_new_run_reads(run, succeed, refuse, monkeypatch):
     """So it can be resumed, however soon it was stopped; and a scene file of the user's own."""
     succeed(*OPTIMIZE, "out", "--iterations", "1")
 
-    def stopped(*_: object) -> None:
+    def stopped(*_):
         raise KeyboardInterrupt
 
     again = ["optimize", "out/scene.yaml", "-q", "-o", "out", "--iterations", "1"]
@@ -156,7 +146,7 @@ def test_overwriting_keeps_what_the_new_run_reads(
         assert line.startswith("out/scene.yaml: was changed and would be replaced")
 
 
-def test_a_run_tells_on_stderr_how_far_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_tells_on_stderr_how_far_it_is(run, monkeypatch):
     """What takes long, progress and finer cells, unless it is quiet; its time at last."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 8)
     monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
@@ -182,7 +172,7 @@ def test_a_run_tells_on_stderr_how_far_it_is(run: Run, monkeypatch: pytest.Monke
     assert "..." not in run("optimize", "scene.yaml", "-o", "short").stderr
 
 
-def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
+def test_a_report_lists_the_numbers_that_were_found(succeed):
     """As parameters.json has them, and by how much they changed; of a camera its move."""
     searched = ["lights.0.irradiance={init: 2}", "views.front.exposure={init: 0.9}"]
     searched += ["views.front.camera={}", "density={init: 0.1}", "lights.0.direction={}"]
@@ -205,7 +195,7 @@ def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
     assert float(moved) > 0 and float(turned) == pytest.approx(angle, rel=0.05)
 
 
-def test_divergence_keeps_the_last_good_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_divergence_keeps_the_last_good_state(run, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Comparison, "loss_of", lambda *_: torch.tensor(math.nan))
         result = run(*OPTIMIZE, "out")
@@ -217,7 +207,7 @@ def test_divergence_keeps_the_last_good_state(run: Run, monkeypatch: pytest.Monk
     assert run(*OPTIMIZE, "out", "--resume").exit_code == 0
 
 
-def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_ends_by_itself_says_why(succeed, monkeypatch):
     monkeypatch.setattr(tuning, "REST", 10.0)
     result = succeed(*OPTIMIZE, "out", "--iterations", "auto")
     summary, log = read_json("out/summary.json"), rows("out")
@@ -232,11 +222,11 @@ def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.Mo
     assert rows("out") == log
 
 
-def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int) -> None:
+def press_ctrl_c_in(monkeypatch, owner, name, call):
     """Ctrl-C arrives once, at the end of call number `call` of `owner.name`."""
     original, calls = getattr(owner, name), []
 
-    def pressed(*arguments: Any, **options: Any) -> Any:
+    def pressed(*arguments, **options):
         result = original(*arguments, **options)
         calls.append(name)
         if len(calls) == call:
@@ -254,15 +244,13 @@ MOMENTS = {
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_an_interrupted_run_goes_on_to_the_same_bits(
-    run: Run, succeed: Run, density_of: DensityOf, monkeypatch: pytest.MonkeyPatch, moment: str
-) -> None:
+def test_an_interrupted_run_goes_on_to_the_same_bits(run, succeed, density_of, monkeypatch, moment):
     """Its report is there, and says that it goes on; what is resumed is read under its lock."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
     monkeypatch.setattr("ddrecon.run.run_folder.PAGE_SECONDS", 0.0)
     load, call = job.load_checkpoint, MOMENTS[moment][-1]
 
-    def load_locked(*arguments: Any) -> Any:
+    def load_locked(*arguments):
         with pytest.raises(UsageError, match="is writing there"), hold(Path("parts", LOCK)):
             pass
         return load(*arguments)
@@ -285,9 +273,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     assert "It goes on." not in done and 'http-equiv="refresh"' not in done
 
 
-def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
-    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_interrupted_after_its_end_is_told_how_to_finish(run, succeed, monkeypatch):
     with monkeypatch.context() as patch:
         press_ctrl_c_in(patch, quality, "register", 1)
         result = run(*OPTIMIZE, "out")
@@ -297,7 +283,7 @@ def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
     assert Path("out/report.html").is_file()
 
 
-def test_more_iterations_go_on_from_the_end(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_iterations_go_on_from_the_end(succeed, monkeypatch):
     """At the resolution that was reached, and by the folder's own scene as well."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
     command = [*OPTIMIZE, "out", *FINER, "--iterations"]

@@ -2,19 +2,16 @@
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
 from small_scene import SCENE
 
 from ddrecon.errors import SceneError
 from ddrecon.io.files.folders import FILM, MANIFEST
 from ddrecon.io.volumes.table import write_field
 
-Refuse = Callable[..., list[str]]
 COMMANDS = "render scene.yaml -o out", "optimize scene.yaml -o out", "gradcheck scene.yaml"
 COMMANDS += "reference scene.yaml -o out", "export scene.yaml -o out.xml", "check scene.yaml"
 CHANGES = {
@@ -94,16 +91,14 @@ uncertainty full -o ./full => 2 full: holds no run
 """
 
 
-def rows() -> list[tuple[str, int, str]]:
+def rows():
     """A command, its exit code and how its last line begins."""
     parts = [row.partition(" => ") for row in TABLE.strip().split("\n")]
     return [(command, int(told[0]), told[2:]) for command, _, told in parts]
 
 
 @pytest.mark.parametrize(("command", "code", "line"), rows())
-def test_what_cannot_be_done_is_refused(
-    folder: Path, refuse: Refuse, command: str, code: int, line: str
-) -> None:
+def test_what_cannot_be_done_is_refused(folder, refuse, command, code, line):
     del folder
     Path("plain.yaml").write_text(SCENE.partition("optimize:")[0])
     texts = dict.fromkeys(["full/notes.txt", "file", "front.txt", "bad.npz", "mine.png"], "mine")
@@ -118,13 +113,13 @@ def test_what_cannot_be_done_is_refused(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_refuses_scenes_and_data(refuse: Refuse, command: str) -> None:
+def test_every_command_refuses_scenes_and_data(refuse, command):
     for change, (code, expected) in CHANGES.items():
         (line,) = refuse(code, *shlex.split(command.replace("scene.yaml", change)))
         assert line.startswith(expected)
 
 
-def test_everything_is_told_at_once(refuse: Refuse) -> None:
+def test_everything_is_told_at_once(refuse):
     Path("one.npy").write_bytes(b"no picture")
     Path("two.npy").write_bytes(b"no picture")
     gone = "-D", "volume.density={file: gone.npz}", "-D", "views.0.image=gone.npy"
@@ -134,7 +129,7 @@ def test_everything_is_told_at_once(refuse: Refuse) -> None:
     assert [line.split(":")[0] for line in lines] == ["one.npy", "two.npy"]
 
 
-def test_a_run_cannot_go_on_as_another(refuse: Refuse, succeed: Callable[..., object]) -> None:
+def test_a_run_cannot_go_on_as_another(refuse, succeed):
     """Of another scene, with fewer iterations, or from checkpoints that are damaged or gone."""
     again = "optimize", "scene.yaml", "-o", "out", "--iterations", "2"
     succeed(*again)
@@ -155,7 +150,7 @@ def test_a_run_cannot_go_on_as_another(refuse: Refuse, succeed: Callable[..., ob
 
 
 @pytest.mark.parametrize("command", ["render scene.yaml -o out", "gradcheck scene.yaml"])
-def test_a_solve_that_diverges(run: Callable[..., Result], command: str) -> None:
+def test_a_solve_that_diverges(run, command):
     values = np.zeros((4, 5, 6))
     values[1:3, 1:4, 1:4] = 1
     write_field(Path("block.npz"), "density", values, np.array([[-0.5] * 3, [0.5] * 3]))
@@ -167,6 +162,6 @@ def test_a_solve_that_diverges(run: Callable[..., Result], command: str) -> None
     assert re.search(told + r".*diffusion\.scheme=conservative", line)
 
 
-def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> None:
+def test_debug_shows_where_an_error_comes_from(run):
     with pytest.raises(SceneError, match="must be below 1"):
         run("check", "scene.yaml", "--debug", "-D", "volume.g=2")

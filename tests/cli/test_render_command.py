@@ -2,13 +2,11 @@
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from click.testing import Result
 from small_scene import contents
 
 import ddrecon
@@ -18,16 +16,15 @@ from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.run.render_folder import rounds_text
 
-Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
 ROUND = ["-D", "diffusion.transport_rounds=1"]
 
 
-def pixels(name: str) -> np.ndarray:
+def pixels(name):
     return np.load(f"out/{name}.npy", allow_pickle=False)
 
 
-def encoded(linear: np.ndarray) -> np.ndarray:
+def encoded(linear):
     """8-bit sRGB, written out from IEC 61966-2-1."""
     clipped = linear.clip(0, 1)
     return np.round(
@@ -35,7 +32,7 @@ def encoded(linear: np.ndarray) -> np.ndarray:
     )
 
 
-def test_what_a_render_writes_and_says(succeed: Run) -> None:
+def test_what_a_render_writes_and_says(succeed):
     """Of each view an array, a float picture and a preview in sRGB, and a record of all."""
     pytest.importorskip("OpenImageIO")
     result = succeed(*RENDER, *ROUND, "--json", "-D", "diffusion.tolerance=1e-5")
@@ -63,7 +60,7 @@ def test_what_a_render_writes_and_says(succeed: Run) -> None:
     assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
+def test_layers_of_the_exr_put_an_image_over_another(succeed):
     """Image + transmittance times what is behind is the image of a view before it."""
     module = pytest.importorskip("OpenImageIO")
     black = ["-D", "render.background=false", "--view", "front"]
@@ -73,7 +70,7 @@ def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
     layers = dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
     file.close()
 
-    def colors(name: str) -> np.ndarray:
+    def colors(name):
         return np.stack([layers[f"{name}{color}"] for color in "RGB"], -1)
 
     through, image = colors("transmittance."), colors("")
@@ -91,9 +88,7 @@ def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
     np.testing.assert_allclose(pixels("front"), image + through * behind, rtol=1e-5)
 
 
-def test_no_exr_where_openimageio_is_not_installed(
-    succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_exr_where_openimageio_is_not_installed(succeed, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenImageIO", None)
     result = succeed(*RENDER)
     assert not list(Path("out").glob("*.exr"))
@@ -103,7 +98,7 @@ def test_no_exr_where_openimageio_is_not_installed(
 
 
 @pytest.mark.parametrize(("said", "made"), [(0, 0), (1, 2), (3, 3)])
-def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, said: int, made: int) -> None:
+def test_the_fluence_is_a_volume_of_the_scene(succeed, said, made):
     """By two rounds at least, but none where there are to be none; in color where colors differ."""
     rounds, scattering = "diffusion.transport_rounds=", f"volume.sigma_s={[5, 6, 7] if said else 5}"
     told = succeed(*RENDER, "--fluence", "-D", f"{rounds}{said}", "-D", scattering).stdout
@@ -126,15 +121,13 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, said: int, made: int
         (2, 2e-6, 1e-6, "not at rest"),
     ],
 )
-def test_it_is_said_whether_light_has_come_to_rest(
-    count: int, residual: float, tolerance: float | None, verdict: str
-) -> None:
+def test_it_is_said_whether_light_has_come_to_rest(count, residual, tolerance, verdict):
     words = rounds_text(count, residual, tolerance)
     begin = f"transport rounds: {count}, the last changed light by {100 * residual:.2g} %: "
     assert words.startswith(begin + verdict)
 
 
-def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
+def test_a_balance_is_printed_and_a_record(succeed):
     record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
     assert set(record["enters"]) == {"lights.0", "lights.1"}
     assert set(record["leaves"]) == {sign + axis for sign in "-+" for axis in "xyz"}
@@ -146,7 +139,7 @@ def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     assert "neither absorbed nor left" in succeed("balance", "scene.yaml").stdout
 
 
-def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
+def test_another_light_is_as_if_the_scene_had_it(succeed):
     sky = "{type: ambient, radiance: 0.3}"
     lamp = "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}"
     words = succeed(*RENDER, "--light", sky, "--light", lamp).stdout
@@ -155,7 +148,7 @@ def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
     assert np.array_equal(pixels("front"), relit) and "PSNR" not in words
 
 
-def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> None:
+def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed):
     scene = ddrecon.load_scene("scene.yaml")
     frames = [
         {"transform_matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]], "file_path": f"no_{n}.png"}
@@ -170,7 +163,7 @@ def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> Non
     np.testing.assert_allclose(named, pixels("front"), rtol=1e-4)
 
 
-def test_a_size_keeps_the_width_of_view(succeed: Run) -> None:
+def test_a_size_keeps_the_width_of_view(succeed):
     """The mean of twice as many pixels is near the picture of few, and a taller one goes on."""
     succeed(*RENDER, "--view", "front", "--size", "80", "60")
     fine = pixels("front")
@@ -180,9 +173,7 @@ def test_a_size_keeps_the_width_of_view(succeed: Run) -> None:
 
 
 @pytest.mark.parametrize("movie", ["out/ring.png", "m.mp4"])
-def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
-    succeed: Run, monkeypatch: pytest.MonkeyPatch, movie: str
-) -> None:
+def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(succeed, monkeypatch, movie):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr("ddrecon.run.render_folder.FEW", 2)
     options = [] if movie.startswith("out") else ["--movie", movie]
@@ -210,8 +201,6 @@ def test_a_ring_is_a_movie_by_the_exposure_of_its_previews(
     np.testing.assert_allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
 
 
-def test_a_movie_that_lacks_a_package_is_refused_before_rendering(
-    refuse: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_movie_that_lacks_a_package_is_refused_before_rendering(refuse, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert refuse(3, *RENDER, "--movie", "m.mp4") == [f"m.mp4: {advice('imageio_ffmpeg')}"]

@@ -2,30 +2,25 @@
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
 from far_device import FAR
 from small_scene import contents
-from torch import Tensor
 
 from ddrecon.cli.session import Session
 from ddrecon.losses import Target
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
 REFERENCE = ["reference", "scene.yaml", "-o", "out", "-q", "--spp", "8"]
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
 
 
-def pixels(name: str) -> np.ndarray:
+def pixels(name):
     return np.load(f"out/{name}.npy", allow_pickle=False)
 
 
-def test_theirs_ours_and_the_difference(succeed: Run) -> None:
+def test_theirs_ours_and_the_difference(succeed):
     pytest.importorskip("mitsuba", reason=NEEDED)
     result = succeed(*REFERENCE, "--json")
     report = json.loads(Path("out/reference.json").read_text())
@@ -47,7 +42,7 @@ def test_theirs_ours_and_the_difference(succeed: Run) -> None:
         assert view["brightness"] == pytest.approx(ours.mean() / theirs.mean(), rel=1e-4)
 
 
-def test_ours_is_what_render_makes(succeed: Run) -> None:
+def test_ours_is_what_render_makes(succeed):
     pytest.importorskip("mitsuba", reason=NEEDED)
     succeed(*REFERENCE, "--view", "side")
     assert not list(Path("out").glob("front*"))
@@ -55,7 +50,7 @@ def test_ours_is_what_render_makes(succeed: Run) -> None:
     np.testing.assert_array_equal(pixels("side.ours"), np.load("rendered/side.npy"))
 
 
-def test_views_are_targets(succeed: Run) -> None:
+def test_views_are_targets(succeed):
     pytest.importorskip("mitsuba", reason=NEEDED)
     succeed(*REFERENCE, "--views")
     names = [name.split(".") for name in contents(Path("out"))]
@@ -66,7 +61,7 @@ def test_views_are_targets(succeed: Run) -> None:
     succeed("render", "scene.yaml", "-o", "rendered", "-q")
 
 
-def test_without_mitsuba(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_mitsuba(refuse, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     told = 'the reference renderer needs mitsuba: pip install "ddrecon[reference]"'
     assert refuse(3, *REFERENCE) == [told]
@@ -77,7 +72,7 @@ SIMPLE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0"]
 GRADCHECK = ["gradcheck", "scene.yaml", "-q", "--samples", "2"]
 
 
-def test_the_program_passes(run: Run) -> None:
+def test_the_program_passes(run):
     result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout.splitlines()[-2].startswith("| density | pass |")
@@ -88,12 +83,12 @@ def test_the_program_passes(run: Run) -> None:
     assert check["modes_error"] < 1e-10 and max(entry["error"] for entry in check["entries"]) < 1e-6
 
 
-def detaching_part(right: Callable[..., Tensor]) -> Callable[..., Tensor]:
+def detaching_part(right):
     """The image loss with the right value and nine tenths of its derivative."""
     return lambda target, image: right(target, 0.9 * image + 0.1 * image.detach())
 
 
-def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_derivative_fails(run, monkeypatch):
     monkeypatch.setattr(Target, "loss_of", detaching_part(Target.loss_of))
     result = run(*GRADCHECK, *SMALL, *SIMPLE, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (1, "")
@@ -106,7 +101,7 @@ def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("shapes_by_python")
-def test_commands_end_well_there(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_end_well_there(succeed, monkeypatch):
     monkeypatch.setattr(Session, "start", lambda _: FAR)
     text = Path("scene.yaml").read_text()
     Path("scene.yaml").write_text(text.replace("  - {type: ambient, radiance: 0.1}\n", ""))

@@ -2,12 +2,11 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from small_scene import contents, write_scene
 from test_optimize_command import press_ctrl_c_in
 
@@ -16,15 +15,13 @@ from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.uncertainty import Uncertainty
 
-Run = Callable[..., Result]
-Refuse = Callable[..., list[str]]
 FREE = "-D optimize.parameters={density: {init: 0.2}, g: {}, lights.0.irradiance: {}}"
 FAST = ["-D", "diffusion.model=none", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
 KNOWN = ["-q", "-D", "optimize.noise={read: 0.05}"]
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """A folder with a run that is finished, of density and two kinds of numbers."""
     folder = tmp_path_factory.mktemp("finished")
     scene = str(write_scene(folder))
@@ -34,16 +31,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def finished(folder: Path, made: Path) -> Path:
+def finished(folder, made):
     """The run, in the current folder."""
     return Path(shutil.copytree(made, folder / "run"))
 
 
-def volume(folder: str, name: str) -> np.ndarray:
+def volume(folder, name):
     return read_field(Path(folder, "volumes", f"{name}.npz"), name).values
 
 
-def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -> None:
+def test_it_writes_deviations_numbers_and_a_page(finished, succeed):
     told = succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1", "-q")
     record = json.loads(Path("sure/uncertainty.json").read_text())
     assert record["experiments"] == 1 and record["fields"]["density"]["within_1"] is None
@@ -70,7 +67,7 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
     assert set(field_names(Path("sure.npz"))) == {"density_std", "density_mean"}
 
 
-def test_no_run_is_harmed(finished: Path, succeed: Run, refuse: Refuse) -> None:
+def test_no_run_is_harmed(finished, succeed, refuse):
     """Nor is a folder made where there is nothing to go on with; what was written has its names."""
     assert files_of("run") == set(names_in(finished))
     (finished / "frames").mkdir()  # which makes no film of it
@@ -88,14 +85,12 @@ def test_no_run_is_harmed(finished: Path, succeed: Run, refuse: Refuse) -> None:
     assert line.startswith("sure: is the folder of another kind of job, uncertainty")
 
 
-def files_of(folder: str) -> set[str]:
+def files_of(folder):
     return {name for name, data in contents(Path(folder)).items() if data} - {MANIFEST}
 
 
 @pytest.mark.slow
-def test_one_that_stops_goes_on_to_the_same_bits(
-    finished: Path, run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_that_stops_goes_on_to_the_same_bits(finished, run, succeed, monkeypatch):
     """Also amid an experiment, here the second."""
     succeed("uncertainty", "run", "-o", "whole", *KNOWN)
     with monkeypatch.context() as context:

@@ -44,7 +44,7 @@ def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
     torch.testing.assert_close(thickness, torch.full_like(empty, FLOOR), rtol=1e-14, atol=0)
 
 
-def mean_inverse_distance(grid: Grid, points: Tensor, part: float = 1.0) -> Tensor:
+def mean_inverse_distance(grid, points, part=1.0):
     """That of the origin to a cell, `part` of it wide, at `points` [N, 3], by Gauss-Legendre."""
     nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(12))
     size = part * torch.tensor(grid.spacing, dtype=torch.float64)
@@ -87,9 +87,7 @@ def test_flat_cells_have_distances_of_their_shape():
 
 
 @pytest.mark.parametrize(("cells", "half_side"), [(24, 0.5), (24, 1.0), (48, 0.5)])
-def test_light_around_a_sphere_leaves_it_by_marshaks_condition_whatever_the_box(
-    cells: int, half_side: float
-):
+def test_light_around_a_sphere_leaves_it_by_marshaks_condition_whatever_the_box(cells, half_side):
     """D = distance / 4 makes L0 fall as 1 / distance^2: F = L0 / 2 on the medium as on the box.
 
     On the finest grid distances are interpolated.

@@ -2,19 +2,18 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from graphics_cards import assert_compiles
 from media import assert_near, box_grid, half_empty, random_values
-from test_solve import FORMS, Shape, in_double, patchy, patchy_box, uneven
-from twins import Function, Tensors, assert_twins
+from test_solve import FORMS, in_double, patchy, patchy_box, uneven
+from twins import assert_twins
 
 from ddrecon.diffusion.cells import average, bend
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solve import Solution, TensorSteps, solve_by_multigrid
+from ddrecon.diffusion.solve import TensorSteps, solve_by_multigrid
 from ddrecon.engine import use_engine
 from ddrecon.medium.coefficients import Volume, scale_medium
 
@@ -26,25 +25,23 @@ from ddrecon.diffusion.fused.passes import KernelSteps
 from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
-Colors = tuple[int, int]
-"""Of the medium and of the light."""
 
 
 @pytest.mark.parametrize("shape", [(2, 5, 4, 6), (1, 2, 3, 1), (1, 1, 1, 1)], ids=str)
-def test_means_and_bends_in_cells_agree(shape: Shape):
+def test_means_and_bends_in_cells_agree(shape):
     values = {"field": random_values(*shape)}
 
-    def find(of: Tensors) -> list[torch.Tensor]:
+    def find(of):
         return [torch.stack([average(of["field"]), bend(of["field"])])]
 
     assert_twins(find, values, 1e-13, least=1.0)
 
 
-def system_and_flux(shape: Shape, periodic: tuple[int, ...] = ()) -> Function:
+def system_and_flux(shape, periodic=()):
     """All that a diffusion problem is asked for, as a function of medium, source and light."""
     grid = replace(box_grid(shape), periodic=periodic)
 
-    def find(values: Tensors) -> list[torch.Tensor]:
+    def find(values):
         medium = [values[name] for name in ("density", "sigma_a", "sigma_s", "g")]
         scaled, closure = scale_medium(Volume(grid, *medium)), lambda k: 1 / (3 * k + 0.5)
         problem = DiffusionProblem(scaled, closure, values["source"], values["outside"], True)
@@ -57,9 +54,7 @@ def system_and_flux(shape: Shape, periodic: tuple[int, ...] = ()) -> Function:
     return find
 
 
-def system_values(
-    shape: Shape, colors: Colors, has_fields: bool = False, is_directed: bool = True
-) -> Tensors:
+def system_values(shape, colors, has_fields=False, is_directed=True):
     cells, (of_medium, of_light) = shape if has_fields else (), colors
     sources = random_values(4 if is_directed else 1, *shape, of_light, seed=11)
     return {
@@ -83,9 +78,7 @@ SYSTEMS = [
 
 
 @pytest.mark.parametrize(("shape", "colors", "has_fields", "is_directed"), SYSTEMS, ids=str)
-def test_systems_and_fluxes_agree(
-    shape: Shape, colors: Colors, has_fields: bool, is_directed: bool
-):
+def test_systems_and_fluxes_agree(shape, colors, has_fields, is_directed):
     values, find = system_values(shape, colors, has_fields, is_directed), system_and_flux(shape)
     assert_twins(find, values, least=1e-2)
     single = {name: value.float() for name, value in values.items()}
@@ -93,7 +86,7 @@ def test_systems_and_fluxes_agree(
 
 
 @pytest.mark.parametrize(("shape", "periodic"), [((5, 4, 9), (0, 2)), ((3, 4, 1), (1, 2))])
-def test_around_a_period_they_agree(shape: Shape, periodic: tuple[int, ...]):
+def test_around_a_period_they_agree(shape, periodic):
     assert_twins(system_and_flux(shape, periodic), system_values(shape, (1, 3)), least=1e-2)
 
 
@@ -102,18 +95,12 @@ def test_around_a_period_they_agree(shape: Shape, periodic: tuple[int, ...]):
 SHAPES = [(1, 1, 1), (1, 1, 9), (1, 12, 17), (9, 1, 1), (2, 3, 40), (7, 8, 9), (16, 5, 11)]
 
 
-def solve(
-    engine: str,
-    operator: Operator,
-    source: torch.Tensor,
-    tolerance: float,
-    guess: torch.Tensor | None = None,
-) -> Solution:
+def solve(engine, operator, source, tolerance, guess=None):
     use_engine(engine)
     return solve_by_multigrid(replace(operator, prepared={}), source, guess, tolerance)
 
 
-def assert_steps_agree(operator: Operator, seed: int = 4) -> None:
+def assert_steps_agree(operator, seed=4):
     """Those of an iteration, one after another: V-cycle, direction and solution, and their sums."""
     source = random_values(*operator.loss.shape, seed=seed) - 0.5
     pairs = [KernelSteps(operator, source), TensorSteps(operator, source)]
@@ -129,7 +116,7 @@ def assert_steps_agree(operator: Operator, seed: int = 4) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_a_cycle_and_a_solve_are_those_of_torch(shape: Shape):
+def test_a_cycle_and_a_solve_are_those_of_torch(shape):
     """Of one color or two, in a box or around it; they take as many iterations."""
     for colors, wraps in ((2, False), (1, True)):
         assert_steps_agree(patchy_box(shape, wraps, colors))
@@ -141,7 +128,7 @@ def test_a_cycle_and_a_solve_are_those_of_torch(shape: Shape):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_an_item_may_be_a_cell_in_any_order(order: str):
+def test_an_item_may_be_a_cell_in_any_order(order):
     with as_on_a_gpu(order) as launched:
         for wraps in (False, True):
             assert_steps_agree(patchy_box((7, 8, 9), wraps))
@@ -149,7 +136,7 @@ def test_an_item_may_be_a_cell_in_any_order(order: str):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_grids_are_those_of_torch(form: str):
+def test_grids_are_those_of_torch(form):
     """The same axes are coarsened on every level, also where cells are not cubes, and on a GPU."""
     for place in (nullcontext(), as_on_a_gpu()):
         with place:
@@ -157,7 +144,7 @@ def test_grids_are_those_of_torch(form: str):
 
 
 @pytest.mark.parametrize(("patch", "dtype"), [(1, torch.float32), (4, torch.float64)], ids=str)
-def test_a_million_to_one(patch: int, dtype: torch.dtype):
+def test_a_million_to_one(patch, dtype):
     operator, source = patchy(patch, dtype), random_values(1, 16, 16, 16, dtype=dtype)
     actual, known = (solve(engine, operator, source, 1e-6) for engine in ("warp", "torch"))
     assert abs(actual.iterations - known.iterations) <= 0.1 * known.iterations
@@ -167,7 +154,7 @@ def test_a_million_to_one(patch: int, dtype: torch.dtype):
 
 
 @pytest.mark.parametrize("losses", [1, 3])
-def test_colors_share_conductances(losses: int):
+def test_colors_share_conductances(losses):
     operator, source = uneven((6, 9, 7)), random_values(3, 6, 9, 7)
     loss = operator.loss[:1] + torch.arange(losses, dtype=torch.float64).view(-1, 1, 1, 1)
     shared = Operator(tuple(c[:1] for c in operator.conductances), loss)
@@ -176,7 +163,7 @@ def test_colors_share_conductances(losses: int):
     assert_near(actual.value, known.value, 1e-8)
 
 
-def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+def test_kernels_compile_for_graphics_cards(tmp_path):
     header, place = "diffusion/fused/faces.h", (1, PLACE, GIVEN)
     system = RowFunction(header, "Flow<SYSTEM, 1, 0>", ((),) * 5, *place)
     flux = RowFunction(header, "Flow<FLUX, 1, 3>", ((3, 1, 1, 1, 1),), *place)

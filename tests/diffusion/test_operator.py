@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import pytest
 import torch
@@ -15,7 +14,6 @@ from media import (
     random_values,
     tensor,
 )
-from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import AXES, face_fluxes
@@ -28,7 +26,7 @@ SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, int]):
+def test_the_operator_is_the_matrix_written_with_loops(shape):
     """Of diffusion coefficients over four decades, in two colors."""
     diffusion = 10 ** (4 * random_values(2, *shape, seed=1) - 3)
     operator = make_operator(box_grid(shape), diffusion, random_values(2, *shape, seed=2))
@@ -43,7 +41,7 @@ D_AT_FACES = 0.2
 EXTENT = (1.0, 1.2, 0.8)
 
 
-def manufactured(position: Sequence[Tensor]) -> tuple[Tensor, ...]:
+def manufactured(position):
     """L0, D, kappa_a, kappa_s Q0, kappa_s Q1 and L1 at (z, y, x) that fulfill E2.4-E2.6.
 
     Along each axis L0 is 1 + t (L - t) / (2 D L), so that L0 / 2 = -D dL0/dn on both faces, where D
@@ -65,7 +63,7 @@ def manufactured(position: Sequence[Tensor]) -> tuple[Tensor, ...]:
     return tuple(field.detach()[None] for field in fields)
 
 
-def discrete_error(cells: int) -> float:
+def discrete_error(cells):
     grid = Grid((cells, cells, cells // 2), (0.0, 0.0, 0.0), EXTENT)
     u, diffusion, absorption, source, *flux = manufactured(
         torch.broadcast_tensors(*grid.centers(tensor(0)))
@@ -88,7 +86,7 @@ OUTSIDE = 0.7
 PROBLEMS = [(3, 2, 4), (1, 3, 1), (1, 1, 1)]
 
 
-def make_problem(shape: tuple[int, int, int], has_flux: bool) -> DiffusionProblem:
+def make_problem(shape, has_flux):
     """A gray medium with a beam-like source, in ambient light."""
     sigma, g = torch.tensor([0.5, 6.0], dtype=torch.float64), 0.4 * has_flux
     volume = Volume(box_grid(shape), half_empty(*shape), sigma[:1], sigma[1:], sigma.new_tensor(g))
@@ -101,7 +99,7 @@ def make_problem(shape: tuple[int, int, int], has_flux: bool) -> DiffusionProble
 class FaceByFace:
     """Outward fluxes of a problem, F . n = `own` u(cell) + `other` u(neighbor) + `known` (E2.6)."""
 
-    def __init__(self, problem: DiffusionProblem):
+    def __init__(self, problem):
         self.problem, self.shape = problem, problem.medium.grid.shape
         self.diffusion = problem.diffusion[0]
         scattering = problem.medium.remaining_scattering[0]
@@ -112,11 +110,11 @@ class FaceByFace:
         )
         self.scattered = [scattering * component[0] for component in flux]
 
-    def neighbor(self, cell: tuple[int, ...], axis: int, side: int) -> tuple[int, ...] | None:
+    def neighbor(self, cell, axis, side):
         beside = tuple(i + side * (a == axis) for a, i in enumerate(cell))
         return beside if 0 <= beside[axis] < self.shape[axis] else None
 
-    def flux(self, cell: tuple[int, ...], axis: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
+    def flux(self, cell, axis, side):
         h, d, q = self.problem.medium.grid.spacing[axis], self.diffusion, self.scattered[axis]
         beside = self.neighbor(cell, axis, side)
         if beside is None:  # Marshak's condition on the box
@@ -126,7 +124,7 @@ class FaceByFace:
         mean = 2 / (1 / d[cell] + 1 / d[beside])
         return mean / h, -mean / h, side * mean * (q[cell] + q[beside]) / 2
 
-    def system(self) -> tuple[Tensor, Tensor]:
+    def system(self):
         """The matrix [n, n] and right side [n] of E2.4: outflow + kappa_a u = kappa_s Q0."""
         number = {c: n for n, c in enumerate(itertools.product(*map(range, self.shape)))}
         medium = self.problem.medium
@@ -143,7 +141,7 @@ class FaceByFace:
                     matrix[row, number[beside]] += other / h
         return matrix, right
 
-    def mean_flux(self, u: Tensor, axis: int) -> Tensor:
+    def mean_flux(self, u, axis):
         """L1 = 3 F along `axis`, the mean of both faces of every cell (E2.5)."""
         total = torch.zeros_like(u)
         for cell, side in itertools.product(itertools.product(*map(range, self.shape)), (-1, 1)):
@@ -156,7 +154,7 @@ class FaceByFace:
 
 @pytest.mark.parametrize("has_flux", [False, True])
 @pytest.mark.parametrize("shape", PROBLEMS, ids=str)
-def test_the_system_is_that_put_together_face_by_face(shape: tuple[int, int, int], has_flux: bool):
+def test_the_system_is_that_put_together_face_by_face(shape, has_flux):
     problem = make_problem(shape, has_flux)
     operator, right = problem.system
     matrix, expected = FaceByFace(problem).system()
@@ -165,7 +163,7 @@ def test_the_system_is_that_put_together_face_by_face(shape: tuple[int, int, int
 
 
 @pytest.mark.parametrize("shape", PROBLEMS, ids=str)
-def test_the_flux_is_that_of_each_cells_two_faces(shape: tuple[int, int, int]):
+def test_the_flux_is_that_of_each_cells_two_faces(shape):
     problem, u = make_problem(shape, True), random_values(1, *shape, seed=7)
     for axis, component in enumerate(flux_along_axes(problem.flux(u))):
         expected = FaceByFace(problem).mean_flux(u[0], axis)

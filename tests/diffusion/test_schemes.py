@@ -3,7 +3,6 @@
 import itertools
 import math
 import re
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from media import (
     random_values,
 )
 from test_operator import EXTENT, manufactured
-from torch import Tensor
 
 from ddrecon.diffusion import closures, paper
 from ddrecon.diffusion.implicit import ImplicitSolve, SolveMemory, SolverWithMemory
@@ -38,14 +36,13 @@ from ddrecon.light.moments import flux_along_axes, moments_of_flux
 from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import Volume, keep_medium
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
 DARK = torch.zeros(1, 1, 1, 1, dtype=torch.float64)
 SHAPES = [(3, 2, 4), (1, 2, 3), (1, 1, 1)]
 
 
-def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
+def make_printed(grid, contrast=2.0, colors=2):
     """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
     kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
     stencils, squares = make_stencils(grid, kappa), sum(2 / h**2 for h in grid.spacing)
@@ -55,11 +52,11 @@ def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedO
     return PrintedOperator(grid, stencils, tensors=(diagonal, weights, echo))
 
 
-def transposed(operator: PrintedOperator) -> PrintedOperator:
+def transposed(operator):
     return operator.linearized(torch.zeros_like(operator.tensors[0])).transposed()
 
 
-def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
+def matrix_by_loops(operator, kappa, loss):
     """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin of the operator."""
     grid, shape = operator.grid, operator.grid.shape
     number = {cell: n for n, cell in enumerate(itertools.product(*map(range, shape)))}
@@ -77,7 +74,7 @@ def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> T
     return matrix
 
 
-def matrix_of(operator: PrintedOperator) -> Tensor:
+def matrix_of(operator):
     """The matrix `[C, n, n]` of `operator`, column by column."""
     shape = operator.tensors[0].shape
     columns = torch.eye(math.prod(shape[1:]), dtype=torch.float64).view(-1, 1, *shape[1:])
@@ -85,7 +82,7 @@ def matrix_of(operator: PrintedOperator) -> Tensor:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, int]):
+def test_the_operator_is_the_matrix_written_with_loops(shape):
     operator = make_printed(box_grid(shape), contrast=30.0)
     kappa = 0.1 * 30.0 ** random_values(2, *shape, seed=1)[0]
     expected = matrix_by_loops(operator, kappa, 3 * random_values(2, *shape, seed=2)[0])
@@ -114,7 +111,7 @@ def test_ghost_cells_hold_the_marshak_condition():
             torch.testing.assert_close(flow, leaves, rtol=1e-12, atol=1e-12)
 
 
-def errors_on(cells: int) -> tuple[float, float]:
+def errors_on(cells):
     """Relative RMS errors of L0 and L1 on a grid of `cells` along z."""
     grid = Grid((cells, cells, cells // 2), (0.0, 0.0, 0.0), EXTENT)
     places = torch.broadcast_tensors(*grid.centers(DARK))
@@ -144,10 +141,10 @@ def test_derivatives_of_an_image_agree_with_each_other_and_differences():
 
 
 @pytest.fixture
-def ball() -> Callable[..., Scene]:
+def ball():
     """A ball 0.7 `sigma` optical depths thick in empty space, its surface `width` cells wide."""
 
-    def make(sigma: float, width: float) -> Scene:
+    def make(sigma, width):
         grid = Grid((16, 16, 16), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
         radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
         density = (16 * (0.35 - radius) / width + 0.5).clamp(0, 1)
@@ -179,7 +176,7 @@ SHAPE = (3, 4, 3)
 def make():
     """A half-empty scene of three colors."""
 
-    def scene(density: Tensor | None = None, **changes) -> Scene:
+    def scene(density=None, **changes):
         density = half_empty(*SHAPE) if density is None else density
         lights = {"ambient": (0.3, 0.2, 0.1), "tolerance": 1e-12}
         return make_scene(density, **{"model": "flux_limited", "g": 0.4, **lights} | changes)
@@ -187,9 +184,7 @@ def make():
     return scene
 
 
-def solved(
-    grid: Grid, memory: SolveMemory, tolerance: float, source: Tensor, *tensors: Tensor
-) -> Tensor:
+def solved(grid, memory, tolerance, source, *tensors):
     """The light of kappa_s Q0 = `source`, differentiable by that and by the operator's tensors."""
     solve = SolverWithMemory(iterate_picard, tolerance, memory)
     return ImplicitSolve.apply(
@@ -235,14 +230,14 @@ def test_dense_media_diffuse_as_without_a_limit(make):
 @pytest.mark.parametrize(
     "lights", [{}, {"ambient": None}, {"ambient": None, "directional": None}], ids=str
 )
-def test_an_empty_box_has_finite_derivatives(lights: dict[str, None], make):
+def test_an_empty_box_has_finite_derivatives(lights, make):
     density = torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True)
     scene = with_values(make(density.detach(), **lights), {"density": density})
     (slope,) = torch.autograd.grad(render(scene).sum(), density)
     assert bool(slope.isfinite().all())
 
 
-def test_giving_up_says_what_may_help(make, monkeypatch: pytest.MonkeyPatch):
+def test_giving_up_says_what_may_help(make, monkeypatch):
     monkeypatch.setattr(paper, "PICARD_ITERATIONS", 3)
     words = r"flux-limited .*after 3 iterations .*diffusion\.model=p1"
     with pytest.raises(SolveError, match=words):

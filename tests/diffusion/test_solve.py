@@ -1,13 +1,12 @@
 """Solves: a preconditioner that is symmetric, few iterations, exact derivatives, memory."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from media import dense_matrix, random_values, solve_by_gradients
-from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion import hierarchy, solve
@@ -33,13 +32,13 @@ TOLERANCES = {torch.float32: 1e-5, torch.float64: 1e-11}
 each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
 
 
-def operator_of(diffusion: Tensor, grid: Grid) -> Operator:
+def operator_of(diffusion, grid):
     """Nothing absorbs but the box's faces."""
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
     return Operator((z, y, x), boundary_loss(diffusion, grid), spacing=grid.spacing)
 
 
-def uneven(shape: Shape, sides=(1, 1, 1), dtype: torch.dtype = torch.float64) -> Operator:
+def uneven(shape, sides=(1, 1, 1), dtype=torch.float64):
     """Two colors: D that spans a factor of 1000, and D = 0.1."""
     grid = Grid(shape, tuple(-side / 2 for side in sides), tuple(side / 2 for side in sides))
     z, y, x = (torch.linspace(-1, 1, n + 2, dtype=torch.float64)[1:-1] for n in shape)
@@ -47,7 +46,7 @@ def uneven(shape: Shape, sides=(1, 1, 1), dtype: torch.dtype = torch.float64) ->
     return operator_of((0.1 * torch.stack([1e3**-ball, torch.ones(shape)])).to(dtype), grid)
 
 
-def patchy(patch: int, dtype: torch.dtype, cells: int = 16) -> Operator:
+def patchy(patch, dtype, cells=16):
     """D that spans a million, random and the same within patches of so many cells a side."""
     diffusion = 0.1 * 1e6 ** -random_values(1, *(cells // patch,) * 3)
     for axis in AXES:
@@ -55,7 +54,7 @@ def patchy(patch: int, dtype: torch.dtype, cells: int = 16) -> Operator:
     return operator_of(diffusion.to(dtype), Grid((cells,) * 3, (-0.5,) * 3, (0.5,) * 3))
 
 
-def patchy_box(shape: Shape, wraps: bool = False, colors: int = 2) -> Operator:
+def patchy_box(shape, wraps=False, colors=2):
     """Random conductances; those on the box conduct between its ends if it `wraps`."""
     faces = [random_values(colors, *shape, seed=axis) + 0.01 for axis in AXES]
     for axis, conductances in zip(AXES, faces, strict=True):
@@ -65,14 +64,14 @@ def patchy_box(shape: Shape, wraps: bool = False, colors: int = 2) -> Operator:
     return Operator(tuple(faces), random_values(colors, *shape, seed=9), periodic)
 
 
-def in_double(operator: Operator) -> Operator:
+def in_double(operator):
     return Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
 
 
 # --- the V-cycle ---
 
 
-def cycle_matrix(operator: Operator) -> Tensor:
+def cycle_matrix(operator):
     """The matrix [C, n, n] of a V-cycle, column by column."""
     hierarchy, shape = Hierarchy.of(operator, Passes()), operator.loss.shape
     units = torch.eye(math.prod(shape[1:]), dtype=torch.float64).view(-1, 1, *shape[1:])
@@ -88,7 +87,7 @@ CYCLES: list[tuple[str, Callable[[], Operator]]] = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in CYCLES], ids=[name for name, _ in CYCLES])
-def test_a_cycle_is_symmetric_and_positive_definite(make: Callable[[], Operator]):
+def test_a_cycle_is_symmetric_and_positive_definite(make):
     matrix = cycle_matrix(make())
     assert float((matrix - matrix.mT).abs().max()) < 1e-13 * float(matrix.abs().max())
     assert float(torch.linalg.eigvalsh(matrix).min()) > 0
@@ -96,9 +95,7 @@ def test_a_cycle_is_symmetric_and_positive_definite(make: Callable[[], Operator]
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize(("cells", "wraps"), [(2, False), (2, True), (5, False), (6, True)])
-def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
-    axis: int, cells: int, wraps: bool
-):
+def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(axis, cells, wraps):
     shape = tuple(cells if a == axis else 3 for a in AXES)
     operator = patchy_box(shape, wraps)
     coarsening, coarse = Passes().coarsen(operator, axis)
@@ -110,7 +107,7 @@ def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
 
 
 @pytest.mark.parametrize("wraps", [False, True])
-def test_few_cells_are_solved_directly(wraps: bool):
+def test_few_cells_are_solved_directly(wraps):
     operator, u = patchy_box((3, 4, 5), wraps), random_values(2, 3, 4, 5, seed=7)
     source, matrix = operator.apply(u), matrix_of(operator)
     torch.testing.assert_close(matrix, dense_matrix(operator))
@@ -123,14 +120,14 @@ def test_few_cells_are_solved_directly(wraps: bool):
 
 @pytest.mark.parametrize("form", FORMS)
 @each_dtype
-def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch.dtype):
+def test_boxes_and_cells_of_any_form_take_few_iterations(form, dtype):
     shape, sides = FORMS[form]
     operator, source = uneven(shape, sides, dtype=dtype), random_values(2, *shape, dtype=dtype)
     assert solve_by_multigrid(operator, source, None, 1e-6).iterations <= 15
 
 
 @each_dtype
-def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
+def test_patches_of_a_million_to_one_take_few_iterations(dtype):
     """Random in every cell they take more, but less than a third of conjugate gradients alone."""
     source = random_values(1, 16, 16, 16, dtype=dtype)
     assert solve_by_multigrid(patchy(4, dtype), source, None, 1e-6).iterations <= 15
@@ -145,7 +142,7 @@ def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
 
 @each_dtype
 @pytest.mark.parametrize("is_uneven", [False, True])
-def test_the_residual_is_reached_and_no_step_leads_away(dtype: torch.dtype, is_uneven: bool):
+def test_the_residual_is_reached_and_no_step_leads_away(dtype, is_uneven):
     """By diagonal^(-1/2), relative to the source, for every color."""
     operator = uneven((4, 9, 5), dtype=dtype) if is_uneven else patchy_box((4, 9, 5))
     operator = Operator(tuple(c.to(dtype) for c in operator.conductances), operator.loss.to(dtype))
@@ -162,7 +159,7 @@ def test_the_residual_is_reached_and_no_step_leads_away(dtype: torch.dtype, is_u
 
 
 @pytest.mark.parametrize("losses", [1, 3])
-def test_colors_do_not_mix_and_may_share_conductances(losses: int):
+def test_colors_do_not_mix_and_may_share_conductances(losses):
     operator, source = patchy_box((6, 9, 7), colors=3), random_values(3, 6, 9, 7)
     faces, loss = [c[:1] for c in operator.conductances], operator.loss[:losses]
     together = solve_by_multigrid(Operator(tuple(faces), loss), source, None, 1e-11).value
@@ -180,7 +177,7 @@ GUESSES = {
 
 
 @pytest.mark.parametrize("guess", GUESSES.values(), ids=GUESSES)
-def test_a_useless_start_does_no_harm(guess: Tensor):
+def test_a_useless_start_does_no_harm(guess):
     """One that is worse than zero is not used."""
     operator, source = patchy_box((4, 5, 3)), random_values(2, 4, 5, 3, seed=3)
     warm, known = (solve_by_multigrid(operator, source, u, 1e-8).value for u in (guess, None))
@@ -193,7 +190,7 @@ def test_no_source_no_light():
 
 
 @pytest.mark.parametrize("where", ["nowhere", "source", "loss"])
-def test_a_solve_that_does_not_converge_says_so(where: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_solve_that_does_not_converge_says_so(where, monkeypatch):
     """For want of iterations, or since a number is not finite."""
     operator, source = patchy_box((4, 5, 3)), random_values(2, 4, 5, 3, seed=3)
     spoiled = {"source": source, "loss": operator.loss}
@@ -211,7 +208,7 @@ MODES: dict[str, Any] = {"check_forward_ad": True, "fast_mode": True}
 TO_ROUNDING = {"eps": 1e-5, "atol": 1e-8, "rtol": 1e-7, **MODES}
 
 
-def solving(memory: SolveMemory | None = None) -> Callable[..., Tensor]:
+def solving(memory=None):
     """u as a function of source, loss and the three conductances, solved to rounding."""
     solver = SolverWithMemory(solve_by_multigrid, 1e-14, memory or SolveMemory())
     return lambda source, loss, *conductances: solve_diffusion(
@@ -219,7 +216,7 @@ def solving(memory: SolveMemory | None = None) -> Callable[..., Tensor]:
     )
 
 
-def inputs(shape: Shape = (2, 3, 2), colors: int = 2) -> list[Tensor]:
+def inputs(shape=(2, 3, 2), colors=2):
     """Source, loss and conductances; a source of two colors may have a gray operator."""
     operator = patchy_box(shape, colors=colors)
     return [random_values(2, *shape) - 0.5, 1 + operator.loss, *operator.conductances]
@@ -233,7 +230,7 @@ def inputs(shape: Shape = (2, 3, 2), colors: int = 2) -> list[Tensor]:
         ((2, 3, 2), 1, range(5)),
     ],
 )
-def test_both_derivatives_agree_with_differences(shape: Shape, colors: int, varied: Sequence[int]):
+def test_both_derivatives_agree_with_differences(shape, colors, varied):
     """By all arguments or by one; and where a gray operator serves a colored source."""
     arguments = inputs(shape, colors)
     for index in varied:
@@ -241,15 +238,13 @@ def test_both_derivatives_agree_with_differences(shape: Shape, colors: int, vari
     assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
 
 
-def test_the_adjoint_takes_what_the_forward_solve_prepared_of_the_operator(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_the_adjoint_takes_what_the_forward_solve_prepared_of_the_operator(monkeypatch):
     source, loss, *conductances = (tensor.requires_grad_() for tensor in inputs())
     operator = Operator(tuple(conductances), loss)
     solver = SolverWithMemory(solve_by_multigrid, 1e-12, SolveMemory())
     u = solve_diffusion(solver, operator, source)
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise AssertionError("prepared again")
 
     monkeypatch.setattr(hierarchy.Hierarchy, "of", refuse)
@@ -270,7 +265,7 @@ def test_every_solve_is_recorded():
 
 
 @pytest.mark.parametrize("is_warm", [True, False])
-def test_a_second_solve_starts_from_the_first(is_warm: bool):
+def test_a_second_solve_starts_from_the_first(is_warm):
     memory, (source, loss, *faces) = SolveMemory(is_warm), inputs((4, 5, 3))
     for tolerance in (1e-10, 1e-9):
         solver = SolverWithMemory(solve_by_multigrid, tolerance, memory)

@@ -2,7 +2,6 @@
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from ddrecon.bench import CASES
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
@@ -22,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def commands(page: Path) -> list[str]:
+def commands(page):
     """Every `ddrecon ...` in a code block of `page`."""
     text = page.read_text(encoding="utf-8")
     blocks = re.findall(r"^```(?:bash|sh|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
@@ -32,7 +30,7 @@ def commands(page: Path) -> list[str]:
     return [part for part in parts if part.startswith("ddrecon ")]
 
 
-def fewer_cells(scene: str) -> list[str]:
+def fewer_cells(scene):
     """Overrides that leave `scene` about 8 cells along its shortest side, where it has a number."""
     found = re.search(
         r"^  resolution: \[(\d+), (\d+), (\d+)\]",
@@ -49,7 +47,7 @@ ONE, NO_ROUNDS = ["-D", "volume.density=1"], ["-D", "diffusion.transport_rounds=
 ONE_PARAMETER = ["--samples", "2", "-D", "optimize={parameters: {lights.0.direction: {}}}"]
 
 
-def quick(command: str) -> list[str]:
+def quick(command):
     """The arguments of `command`, and those that make it quick."""
     _, name, *rest = shlex.split(command, comments=True)
     added = {
@@ -64,16 +62,16 @@ def quick(command: str) -> list[str]:
     return [name, *rest, *added]
 
 
-def few(variants: Callable[..., dict]) -> Callable[..., dict]:
+def few(variants):
     return lambda *scene: dict([*variants(*scene).items()][:3])
 
 
-def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:
+def coarse(load):
     return lambda *arguments: [scene_at_level(scene, 4) for scene in load(*arguments)]
 
 
 @pytest.fixture
-def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def surroundings(tmp_path, monkeypatch):
     """A folder with configs and data, and a cloud; few hard cases; a bench of few cells."""
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
@@ -88,7 +86,7 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("page", list(filter(commands, PAGES)), ids=lambda page: page.stem)
-def test_the_commands_of_a_page_run(page: Path, surroundings: None) -> None:
+def test_the_commands_of_a_page_run(page, surroundings):
     for command in commands(page):
         if command.startswith("ddrecon reference"):
             pytest.importorskip("mitsuba", reason="Mitsuba 3 is not installed (extra `reference`)")
@@ -96,7 +94,7 @@ def test_the_commands_of_a_page_run(page: Path, surroundings: None) -> None:
         assert result.exit_code == 0, f"{command}: {result.output}"
 
 
-def test_the_python_of_its_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_its_page_runs(monkeypatch):
     """Block after block, as somebody would paste them; of training, few steps."""
     monkeypatch.chdir(ROOT)
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")

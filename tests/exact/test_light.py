@@ -3,13 +3,11 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from media import half_empty, make_camera, make_scene
-from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
@@ -19,7 +17,6 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.lighting import solve_light
 from ddrecon.medium.optics import WHITE, black_body_radiance
 from ddrecon.picture import render, view_components
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
 
@@ -28,7 +25,7 @@ COLORS = torch.tensor([0.7, 0.3, 0.1], dtype=torch.float64)
 ENGINES = ["torch", pytest.param("warp", marks=pytest.mark.slow)]
 
 
-def glowing(density: float | Tensor, emission: Tensor | None, **more: Any) -> Scene:
+def glowing(density, emission, **more):
     """Seen by parallel rays along z, whose way through the box is 1."""
     camera = make_camera((0.0, 0.0, 2.5), (3, 3), 0.2, is_perspective=False)
     if isinstance(density, float):
@@ -37,7 +34,7 @@ def glowing(density: float | Tensor, emission: Tensor | None, **more: Any) -> Sc
     return make_scene(density, grid=GRID, camera=camera, emission=emission, **settings)
 
 
-def use(engine: str) -> None:
+def use(engine):
     if engine == "warp":
         pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
     use_engine(engine)
@@ -46,7 +43,7 @@ def use(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("model", ["p1", "none"])
 @pytest.mark.parametrize("density", [0.0, 0.8])
-def test_an_even_box_shines_by_its_length(engine: str, model: str, density: float) -> None:
+def test_an_even_box_shines_by_its_length(engine, model, density):
     """(1 - exp(-kappa L)) j / kappa, or j L where it is empty."""
     use(engine)
     kappa = 2.0 * density
@@ -55,7 +52,7 @@ def test_an_even_box_shines_by_its_length(engine: str, model: str, density: floa
     torch.testing.assert_close(image, (COLORS * length).view(3, 1, 1).expand_as(image))
 
 
-def test_an_image_is_the_sum_of_what_lamps_and_emission_show() -> None:
+def test_an_image_is_the_sum_of_what_lamps_and_emission_show():
     """Light is linear in its sources; and emission in other units of length is the same picture."""
     density, emission = half_empty(*GRID.shape), half_empty(3, *GRID.shape, seed=1)
     settings = {"sigma_s": (5.0,), "transport_rounds": 2}
@@ -69,7 +66,7 @@ def test_an_image_is_the_sum_of_what_lamps_and_emission_show() -> None:
     torch.testing.assert_close(parts.reduced, render(black)[0])
 
 
-def test_a_black_body_follows_stefan_and_boltzmanns_kin() -> None:
+def test_a_black_body_follows_stefan_and_boltzmanns_kin():
     """Luminance 1 at a flame's temperature; hotter is brighter and bluer, cold is dark.
 
     By Wien's law luminance grows as exp(-c / T), c being h c / k over some 570 to 600 nm.
@@ -91,7 +88,7 @@ ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)
 """Two directions (x, y, z) that are along no axis of the grid."""
 
 
-def unlike_its_mirror(cells: int) -> torch.Tensor:
+def unlike_its_mirror(cells):
     """A smooth density without symmetry, zero at the faces of the unit box."""
     grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
     z, y, x = grid.centers(torch.zeros(1, dtype=torch.float64))
@@ -99,9 +96,7 @@ def unlike_its_mirror(cells: int) -> torch.Tensor:
     return hump * (1 + 0.8 * torch.sin(3 * z + 2 * y) * torch.cos(4 * x))
 
 
-def power_seen(
-    scene: Scene, travel: tuple[float, float, float], towards: tuple[float, float, float]
-) -> tuple[float, float]:
+def power_seen(scene, travel, towards):
     """What leaves along `towards` of light along `travel`, scattered once, and more often."""
     eye = torch.nn.functional.normalize(torch.tensor(towards, dtype=torch.float64), dim=0) * 3 + 0.5
     pose = look_at(eye, torch.full_like(eye, 0.5), eye.new_tensor([0.0, 1.0, 0.0]))
@@ -111,7 +106,7 @@ def power_seen(
     return float(parts.single[0].mean()), float(parts.multiple[0].mean())
 
 
-def asymmetry(cells: int, g: float) -> tuple[float, float]:
+def asymmetry(cells, g):
     """How much the ways from ONE to OTHER and back differ, of single and of multiple scattering."""
     grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
     scene = make_scene(unlike_its_mirror(cells), grid=grid, sigma_a=(1.0,), sigma_s=(12.0,), g=g)
@@ -137,7 +132,7 @@ TRACED = [
 """What was traced, beside the config."""
 
 
-def test_the_plumes_derivative_is_that_of_a_path_tracer() -> None:
+def test_the_plumes_derivative_is_that_of_a_path_tracer():
     scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=TRACED)
     density = scene.volume.density
     leaf = density.clone().requires_grad_()

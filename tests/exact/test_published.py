@@ -37,13 +37,13 @@ CLOUDS = {
 }
 
 
-def assert_within(percent: dict[str, float], found: dict[str, Any], truth: dict[str, Any]) -> None:
+def assert_within(percent, found, truth):
     off = {key: percent_off(found[key], truth[key]) for key in truth}
     assert all(abs(off[key]) < percent[key] for key in truth), off
 
 
 @pytest.fixture
-def _has_ordinates() -> None:
+def _has_ordinates():
     pytest.importorskip("PythonicDISORT", reason="discrete ordinates are an extra (`dev`)")
 
 
@@ -63,7 +63,7 @@ def test_ordinates_are_van_de_hulsts_and_ambartsumians():
 @pytest.mark.slow
 @pytest.mark.parametrize("sun", [1.0, 0.5])
 @pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99, 0.999])
-def test_half_spaces_are_ambartsumians(albedo: float, sun: float):
+def test_half_spaces_are_ambartsumians(albedo, sun):
     assert_within(HALF_SPACE, Layer(albedo, sun=sun).seen(), h_reflection(albedo, sun))
 
 
@@ -77,7 +77,7 @@ def test_half_spaces_are_ambartsumians(albedo: float, sun: float):
     ],
     ids=["slab", "periodic", "albedo 0.5", "0.9", "0.99", "slanted"],
 )
-def test_balances_are_those_of_slabs_and_half_spaces(layer: Layer, truth: dict[str, Any]) -> None:
+def test_balances_are_those_of_slabs_and_half_spaces(layer, truth):
     """Within 1 %, or 0.2 % of what enters."""
     found = layer.balance()
     for key in truth.keys() & {"R", "T"}:
@@ -94,7 +94,7 @@ def test_slab_is_van_de_hulsts():
 @pytest.mark.slow
 @pytest.mark.usefixtures("_has_ordinates")
 @pytest.mark.parametrize(("name", "depth"), SLABS)
-def test_slabs_are_those_of_discrete_ordinates(name: str, depth: float):
+def test_slabs_are_those_of_discrete_ordinates(name, depth):
     # One in a box with sides, which takes long; the others repeat.
     has_sides = (name, depth) == ("g 0.75", 1.0)
     sides: dict[str, Any] = {"across": 32.0} if has_sides else {"across": 1.0, "periodic": "xy"}
@@ -104,5 +104,5 @@ def test_slabs_are_those_of_discrete_ordinates(name: str, depth: float):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cloud", CLOUDS, ids=lambda cloud: cloud.name)
-def test_step_cloud_is_the_consensus_of_many_codes(cloud: StepCloud):
+def test_step_cloud_is_the_consensus_of_many_codes(cloud):
     assert_within({"up": CLOUDS[cloud]}, cloud.seen(), cloud.truth())

@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parents[2] / "examples"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs(path, monkeypatch):
     """Cell by cell in one namespace, in its folder; a cell's last expression is shown."""
     monkeypatch.chdir(FOLDER)
     monkeypatch.setenv("MPLBACKEND", "agg")

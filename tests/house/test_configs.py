@@ -13,7 +13,6 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.picture import render
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.setup import Problem, scene_at_level, select_views, start_parameters
-from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.kinds import kind_of, unit_of
 from ddrecon.variables.values import variable_names, with_values
@@ -32,7 +31,7 @@ STEP = 1e-5
 KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
 
 
-def small(config: Path) -> Scene:
+def small(config):
     """The scene about 8 cells along its shortest side, and as much coarser in two pictures."""
     closely = ["diffusion.tolerance=1e-13"]
     scene = load_scene(config, overrides=closely, dtype=torch.float64)
@@ -44,7 +43,7 @@ def small(config: Path) -> Scene:
 
 
 @pytest.mark.parametrize("config", KINDS, ids=lambda config: config.stem)
-def test_a_kind_of_scene_renders(config: Path) -> None:
+def test_a_kind_of_scene_renders(config):
     if "mie" in config.read_text():
         pytest.importorskip("miepython", reason="needs the extra `mie`")
     sizes = ["views.0.camera.resolution=[5, 4]"] if "image:" not in config.read_text() else []
@@ -56,7 +55,7 @@ def test_a_kind_of_scene_renders(config: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
-def test_the_derivative_of_what_a_config_makes_small_is_its_difference(config: Path) -> None:
+def test_the_derivative_of_what_a_config_makes_small_is_its_difference(config):
     """By all that it seeks, each of which its pictures tell something of, near where it starts."""
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:
         pytest.skip("its images need OpenImageIO")
@@ -72,10 +71,10 @@ def test_the_derivative_of_what_a_config_makes_small_is_its_difference(config: P
         ways[one.name] = torch.where(start + 2 * way < one.high, way, -way)
         values[one.name] = start + ways[one.name]
 
-    def loss_of(view: View, image: Tensor) -> Tensor:
+    def loss_of(view, image):
         return level.targets[view.name].loss_of(image)
 
-    def loss_at(step: float) -> float:
+    def loss_at(step):
         moved = {name: value + step * ways[name] for name, value in values.items()}
         world = with_values(level.train, moved)
         with torch.no_grad():

@@ -13,7 +13,7 @@ LONGEST = 600
 SOURCES = sorted(path for kind in ("*.py", "*.h") for path in (ROOT / "ddrecon").rglob(kind))
 
 
-def test_nothing_that_a_package_holds_hides_a_module_of_it() -> None:
+def test_nothing_that_a_package_holds_hides_a_module_of_it():
     for module_info in pkgutil.walk_packages(ddrecon.__path__, "ddrecon."):
         if not module_info.name.endswith("__main__"):
             package, _, last = module_info.name.rpartition(".")
@@ -21,12 +21,12 @@ def test_nothing_that_a_package_holds_hides_a_module_of_it() -> None:
             assert getattr(importlib.import_module(package), last) is module, module_info.name
 
 
-def test_no_source_file_is_long() -> None:
+def test_no_source_file_is_long():
     lengths = {str(path): len(path.read_text().splitlines()) for path in SOURCES}
     assert lengths and {path: length for path, length in lengths.items() if length > LONGEST} == {}
 
 
-def test_every_package_is_listed_with_its_license() -> None:
+def test_every_package_is_listed_with_its_license():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = sum(project["optional-dependencies"].values(), project["dependencies"])
     names = {re.split(r"[><=\[;]", need)[0].strip().lower() for need in wanted} - {"ddrecon"}

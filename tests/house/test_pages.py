@@ -5,7 +5,6 @@ import re
 import shlex
 from dataclasses import is_dataclass
 from pathlib import Path
-from types import ModuleType
 
 import click
 import pytest
@@ -23,7 +22,7 @@ FILE = re.compile(r"`(?:python )?((?:ddrecon|tests|benchmarks|docs|configs|data|
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
-def load_module(path: Path) -> ModuleType:
+def load_module(path):
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -31,7 +30,7 @@ def load_module(path: Path) -> ModuleType:
     return module
 
 
-def anchors_of(page: Path) -> set[str]:
+def anchors_of(page):
     """What a link to a heading of `page` may hold after the #, on GitHub and the built site."""
     headings = re.findall(r"^#+ (.*)", FENCED.sub("", page.read_text()), re.MULTILINE)
     words = [re.sub(r"[^\w\s-]", "", heading).lower() for heading in headings]
@@ -41,7 +40,7 @@ def anchors_of(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", sorted(PAGES), ids=lambda page: str(page.relative_to(ROOT)))
-def test_what_a_page_links_to_and_names_is_there(page: Path) -> None:
+def test_what_a_page_links_to_and_names_is_there(page):
     text = page.read_text(encoding="utf-8")
     assert [file for file in FILE.findall(text) if not (ROOT / file).exists()] == []
     for target in LINK.findall(FENCED.sub("", text)):
@@ -52,7 +51,7 @@ def test_what_a_page_links_to_and_names_is_there(page: Path) -> None:
             assert not anchor or anchor in anchors_of(there), f"{target}: no such heading"
 
 
-def test_every_page_is_in_the_menu() -> None:
+def test_every_page_is_in_the_menu():
     listed = re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     assert sorted(listed) == sorted(page.name for page in DOCS)
 
@@ -60,13 +59,13 @@ def test_every_page_is_in_the_menu() -> None:
 # --- commands and scenes ---
 
 
-def scenes() -> list[str]:
+def scenes():
     """Every block of YAML on a page that is a whole scene."""
     text = "\n".join(page.read_text(encoding="utf-8") for page in [ROOT / "README.md", *DOCS])
     return re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-def commands() -> list[str]:
+def commands():
     """Every `ddrecon ...` in comments of configs."""
     configs = sorted((ROOT / "configs").rglob("*.yaml"))
     text = "\n".join(config.read_text(encoding="utf-8") for config in configs)
@@ -74,7 +73,7 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("line", commands())
-def test_a_command_is_understood(line: str) -> None:
+def test_a_command_is_understood(line):
     """It is parsed, not run."""
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = main.get_command(click.Context(main), name)
@@ -83,7 +82,7 @@ def test_a_command_is_understood(line: str) -> None:
 
 
 @pytest.mark.parametrize("text", scenes())
-def test_a_scene_on_a_page_is_legal(tmp_path: Path, text: str) -> None:
+def test_a_scene_on_a_page_is_legal(tmp_path, text):
     path = tmp_path / "scene.yaml"
     path.write_text(text)
     assert read_scene(path).tree.views
@@ -95,7 +94,7 @@ WITHOUT_SECTION = {schema.Bounds, schema.BoxSection, schema.SceneTree, view_sche
 """Records whose keys are explained with those of others."""
 
 
-def test_the_manual_says_what_the_schema_says_of_every_key() -> None:
+def test_the_manual_says_what_the_schema_says_of_every_key():
     manual = load_module(ROOT / "docs" / "make_scene_file.py")
     for name, text in manual.pages().items():
         assert (ROOT / "docs" / name).read_text() == text, "run: python docs/make_scene_file.py"
@@ -115,7 +114,7 @@ MEASURED = re.compile(r"\d ?(?:dB|ms|s|seconds|minutes|MiB)\b(?! pass)|\d times 
 FIGURES = load_module(ROOT / "benchmarks" / "figures.py")
 
 
-def test_pages_show_what_was_measured() -> None:
+def test_pages_show_what_was_measured():
     store, quoted = FIGURES.read_store(), set()
     for page in FIGURES.pages():
         text = page.read_text(encoding="utf-8")
@@ -128,7 +127,7 @@ def test_pages_show_what_was_measured() -> None:
 
 
 @pytest.mark.parametrize("name", ["README", "accuracy", "benchmarks", "capture", "gallery"])
-def test_pages_quote_no_other_figure(name: str) -> None:
+def test_pages_quote_no_other_figure(name):
     page = ROOT / ("" if name == "README" else "docs") / f"{name}.md"
     text = FIGURES.PLACE.sub("", page.read_text(encoding="utf-8"))
     assert [line for line in text.splitlines() if MEASURED.search(line)] == []
@@ -139,7 +138,7 @@ def test_pages_quote_no_other_figure(name: str) -> None:
 TAG = re.compile(r"\bE(\d+)\.(\d+)(?:-E?\1\.(\d+))?\b")
 
 
-def tags(text: str) -> set[tuple[int, int]]:
+def tags(text):
     """Section and number of tags in `text`; E2.4-E2.6 stands for E2.4, E2.5 and E2.6."""
     return {
         (int(section), number)
@@ -148,7 +147,7 @@ def tags(text: str) -> set[tuple[int, int]]:
     }
 
 
-def test_equations_are_stated_once_in_order_and_those_are_cited_where_they_are_computed() -> None:
+def test_equations_are_stated_once_in_order_and_those_are_cited_where_they_are_computed():
     pages = [(ROOT / "docs" / name).read_text() for name in ("theory.md", "corrections.md")]
     stated = [
         [

@@ -46,13 +46,13 @@ LEFT_OUT = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 FEW = settings(derandomize=True, database=None, max_examples=50, suppress_health_check=LEFT_OUT)
 
 
-def write_hdr(path: Path, pixels: np.ndarray) -> None:
+def write_hdr(path, pixels):
     body = b"".join(bytes([*rgb, 130]) for rgb in np.uint8(128 + 127 * pixels.reshape(-1, 3)))
     size = f"-Y {len(pixels)} +X {pixels.shape[1]}\n".encode()
     path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + size + body)
 
 
-def write_volume(path: Path) -> None:
+def write_volume(path):
     if path.suffix == ".nc":
         with pytest.importorskip("netCDF4").Dataset(path, "w") as file:
             for name, count in zip("zyx", VALUES.shape, strict=True):
@@ -62,7 +62,7 @@ def write_volume(path: Path) -> None:
         write_field(path, "density", VALUES, BOUNDS)
 
 
-def write_encoded(path: Path, pixels: np.ndarray) -> None:
+def write_encoded(path, pixels):
     image, form = (255 * pixels).astype(np.uint8), dict[str, Any]()
     if path.suffix in FILMS:
         load_for_file("imageio_ffmpeg", path)
@@ -81,7 +81,7 @@ WRITERS: dict[str, Callable[[Path, np.ndarray], object]] = {
 
 
 @cache
-def sample(suffix: str, is_volume: bool) -> bytes:
+def sample(suffix, is_volume):
     """A small good file; the test is skipped where it takes a package that is not here."""
     with TemporaryDirectory() as name:
         path = Path(name, f"density{suffix}")
@@ -98,7 +98,7 @@ def sample(suffix: str, is_volume: bool) -> bytes:
         return path.read_bytes()
 
 
-def read(path: Path, is_volume: bool) -> np.ndarray:
+def read(path, is_volume):
     """The values of the file at `path`, which are legal."""
     if not is_volume:
         pixels = read_image(path).pixels
@@ -110,7 +110,7 @@ def read(path: Path, is_volume: bool) -> np.ndarray:
     return values
 
 
-def is_refused(path: Path, is_volume: bool) -> bool:
+def is_refused(path, is_volume):
     """Whether the file is refused, in one line with its path, or else legal."""
     with deadline(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -124,9 +124,7 @@ def is_refused(path: Path, is_volume: bool) -> bool:
 
 @settings(max_examples=15)
 @given(shape=st.tuples(*[st.integers(1, 19)] * 3), has_colors=st.booleans(), seed=st.integers(0))
-def test_fields_come_back_in_their_place(
-    tmp_path_factory, suffix: str, shape: tuple[int, int, int], has_colors: bool, seed: int
-) -> None:
+def test_fields_come_back_in_their_place(tmp_path_factory, suffix, shape, has_colors, seed):
     """Sides differ, mostly; 8 is that of a leaf of OpenVDB's tree."""
     path = tmp_path_factory.mktemp("field") / f"smoke.albedo{suffix}"
     values = np.random.default_rng(seed).uniform(0.01, 1, shape + (3,) * has_colors)
@@ -142,7 +140,7 @@ def test_fields_come_back_in_their_place(
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-def test_float_images_come_back(tmp_path: Path, suffix: str) -> None:
+def test_float_images_come_back(tmp_path, suffix):
     """Whatever the case of the suffix; bit for bit but for .hdr."""
     if suffix in (".exr", ".hdr"):
         pytest.importorskip("OpenImageIO")
@@ -155,9 +153,7 @@ def test_float_images_come_back(tmp_path: Path, suffix: str) -> None:
 
 
 @UNLIKE
-def test_what_is_absent_or_cut_short_is_refused(
-    tmp_path: Path, suffix: str, is_volume: bool
-) -> None:
+def test_what_is_absent_or_cut_short_is_refused(tmp_path, suffix, is_volume):
     """But where nothing is lost, at the very end."""
     path, whole = tmp_path / f"density{suffix}", sample(suffix, is_volume)
     told = refusal(path) if is_volume else image_refusal(path)
@@ -171,9 +167,7 @@ def test_what_is_absent_or_cut_short_is_refused(
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".tiff", ".nc", ".exr", ".hdr"])
-def test_a_missing_package_is_named(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named(tmp_path, suffix, monkeypatch):
     path, package = tmp_path / f"density{suffix}", "netCDF4" if suffix == ".nc" else "OpenImageIO"
     path.write_bytes(b"hello")
     monkeypatch.setitem(sys.modules, package, None)
@@ -181,7 +175,7 @@ def test_a_missing_package_is_named(
 
 
 @st.composite
-def damages(draw: Callable[..., Any]) -> Callable[[bytes], bytes]:
+def damages(draw):
     """A way to damage a file: most bytes of interest are near its ends."""
     kinds = st.sampled_from(["flip", "set", "cut", "remove", "insert", "word"])
     places = st.one_of(st.floats(0, 1), st.floats(0, 0.1), st.floats(0.9, 1))
@@ -189,7 +183,7 @@ def damages(draw: Callable[..., Any]) -> Callable[[bytes], bytes]:
     edit = st.tuples(kinds, places, st.integers(0, 255), counts)
     edits = draw(st.lists(edit, min_size=1, max_size=4))
 
-    def damaged(data: bytes) -> bytes:
+    def damaged(data):
         for kind, place, byte, count in edits:
             at = min(int(place * len(data)), len(data) - 1)
             if len(data) < 2:
@@ -211,9 +205,7 @@ def damages(draw: Callable[..., Any]) -> Callable[[bytes], bytes]:
 @FEW
 @given(damaged=damages())
 @pytest.mark.slow
-def test_a_damaged_file(
-    tmp_path: Path, suffix: str, is_volume: bool, damaged: Callable[[bytes], bytes]
-) -> None:
+def test_a_damaged_file(tmp_path, suffix, is_volume, damaged):
     path = tmp_path / f"density{suffix}"
     path.write_bytes(damaged(sample(suffix, is_volume)))
     # A damaged size may be a legal one: then gigabytes of zeros are read, which takes its time.
@@ -224,7 +216,7 @@ def test_a_damaged_file(
 
 @EVERY
 @pytest.mark.timeout(60)
-def test_what_is_no_file(tmp_path: Path, suffix: str, is_volume: bool) -> None:
+def test_what_is_no_file(tmp_path, suffix, is_volume):
     path = tmp_path / f"density{suffix}"
     for target in (None, path, "/dev/zero"):
         os.symlink(target, path) if target else os.mkfifo(path)
@@ -237,9 +229,7 @@ def test_what_is_no_file(tmp_path: Path, suffix: str, is_volume: bool) -> None:
 
 
 @EVERY
-def test_what_is_too_large_is_refused_by_its_header(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, is_volume: bool
-) -> None:
+def test_what_is_too_large_is_refused_by_its_header(tmp_path, monkeypatch, suffix, is_volume):
     """A zip bomb among them: what its directory says is enough."""
     path = tmp_path / f"density{suffix}"
     path.write_bytes(sample(suffix, is_volume))
@@ -251,7 +241,7 @@ def test_what_is_too_large_is_refused_by_its_header(
 @pytest.mark.parametrize(
     "shape", [(1024, 1024, 1023), (2**40, 2**20, 1), (-2, -3, 1), (0, 2**70, 1), (2**31, 2**31, 4)]
 )
-def test_a_header_that_promises_more_than_there_is(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_a_header_that_promises_more_than_there_is(tmp_path, shape):
     stream = io.BytesIO()
     told = {"descr": "<f4", "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(stream, told)
@@ -264,15 +254,15 @@ def test_a_header_that_promises_more_than_there_is(tmp_path: Path, shape: tuple[
 class Tripwire:
     """A pickle of this makes a folder when it is loaded."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path):
         self.path = path
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return os.mkdir, (str(self.path),)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_a_pickle_is_never_loaded(tmp_path: Path, suffix: str) -> None:
+def test_a_pickle_is_never_loaded(tmp_path, suffix):
     objects = np.full((2, 2, 2), None, object)
     objects[0, 0, 0] = Tripwire(tmp_path / "made")
     path = tmp_path / f"density{suffix}"

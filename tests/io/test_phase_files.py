@@ -1,7 +1,5 @@
 """Tables of phase functions: what is read, and one line for what cannot be."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,14 +11,14 @@ DEGREES = np.array([0.0, 20.0, 90.0, 150.0, 180.0])
 VALUES = np.array([[5.0, 3.0, 1.0, 0.5, 0.7], [6.0, 2.0, 1.0, 0.4, 0.6], [7.0, 1.0, 1.0, 0.3, 0.5]])
 
 
-def write(path: Path, header: str, columns: np.ndarray, separator: str = ", ") -> Path:
+def write(path, header, columns, separator=", "):
     rows = [separator.join(repr(float(number)) for number in row) for row in columns.T]
     path.write_text("\n".join(["# of a test", header, *rows]) + "\n")
     return path
 
 
 @pytest.mark.parametrize("colors", [1, 3])
-def test_a_table_is_read_whatever_its_form(tmp_path: Path, colors: int) -> None:
+def test_a_table_is_read_whatever_its_form(tmp_path, colors):
     table, header = np.vstack([DEGREES, VALUES[:colors]]), ", ".join("rgb"[:colors])
     cosines = np.vstack([np.cos(np.radians(DEGREES)), VALUES[:colors]])
     for path in (
@@ -51,7 +49,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("text", "line"), WRONG.values(), ids=WRONG.keys())
-def test_what_is_wrong_with_a_table_is_one_line(tmp_path: Path, text: str, line: str) -> None:
+def test_what_is_wrong_with_a_table_is_one_line(tmp_path, text, line):
     path = tmp_path / ("table.xlsx" if text == "PK" else "table.csv")
     path.write_text(text)
     with pytest.raises(FormatError, match=line) as caught:
@@ -59,7 +57,7 @@ def test_what_is_wrong_with_a_table_is_one_line(tmp_path: Path, text: str, line:
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_even_angles_keep_what_is_given_and_stay_between_neighbors() -> None:
+def test_even_angles_keep_what_is_given_and_stay_between_neighbors():
     angles = np.linspace(0, np.pi, STEPS // 4 + 1)
     values = np.stack([np.exp(3 * np.cos(angles)), 1 + np.cos(angles) ** 2])
     found = at_even_angles(angles, values)

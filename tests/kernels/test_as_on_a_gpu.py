@@ -12,7 +12,6 @@ from twins import assert_same, differentiate, images_of, values_of
 from ddrecon.engine import use_engine
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import variable_names
 
@@ -27,14 +26,14 @@ MOVES = "camera", "focal", "principal_point", "direction", "position"
 """Ends of names of variables that move rays, beams and lamps."""
 
 
-def variables_of(scene: Scene, moves: bool) -> list[str]:
+def variables_of(scene, moves):
     """All but those that others are made of; with `MOVES` if it `moves`."""
     names = (name for name in variable_names(scene) if name not in ("sigma_t", "albedo"))
     return [name for name in names if moves or not name.endswith(MOVES)]
 
 
 @pytest.mark.slow
-def test_every_kernel_comes_to_the_same_bits_in_any_order() -> None:
+def test_every_kernel_comes_to_the_same_bits_in_any_order():
     headers: set[str] = set()
     for scene, moves in ((smoke(), False), (cloud(), True), (mixture(), True)):
         case = images_of(scene), values_of(scene, variables_of(scene, moves))
@@ -53,7 +52,7 @@ def test_every_kernel_comes_to_the_same_bits_in_any_order() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["satellite", "smoke_sky", "fire", "cumulus_field"])
-def test_no_sum_of_an_iteration_ends_in_any_order(name: str) -> None:
+def test_no_sum_of_an_iteration_ends_in_any_order(name):
     """With a ground, a sky by its map, a loss by noise, a medium that repeats."""
     use_engine("warp")
     scene = load_scene(CONFIGS / f"{name}.yaml")
@@ -63,7 +62,7 @@ def test_no_sum_of_an_iteration_ends_in_any_order(name: str) -> None:
             run.step()
 
 
-def test_sums_in_any_order_are_refused() -> None:
+def test_sums_in_any_order_are_refused():
     field = torch.rand(1, 1, 2, 2, 2, requires_grad=True)
     once, twice, ones = torch.tensor([0, 2]), torch.tensor([1, 1]), torch.ones(2)
     with FixedOrder():
@@ -77,7 +76,7 @@ def test_sums_in_any_order_are_refused() -> None:
             interpolate(field, (3, 3, 3), mode="trilinear").sum().backward()
 
 
-def test_kernels_add_whole_numbers_alone() -> None:
+def test_kernels_add_whole_numbers_alone():
     """Texts have one atomic operation, whose sum has no order."""
     texts = (path.read_text() for path in PACKAGE.rglob("*") if path.suffix in (".h", ".py"))
     atomics = [line.strip() for text in texts for line in text.splitlines() if "atomicA" in line]
@@ -86,7 +85,7 @@ def test_kernels_add_whole_numbers_alone() -> None:
     assert not any("atomic_" in path.read_text() for path in PACKAGE.rglob("*.h"))
 
 
-def test_an_item_that_reads_what_another_writes_is_seen() -> None:
+def test_an_item_that_reads_what_another_writes_is_seen():
     text = "sums[item] = field[item] + (item ? sums[item - 1] : 0);"
     kernel = TextKernel("race", 64, text, "F *field, *sums", "sums")
     field, found = torch.ones(9, dtype=torch.float64), []

@@ -1,7 +1,6 @@
 """Adjoints are compiled beside what is done before them: each kernel once, and none in vain."""
 
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
 
 
 @pytest.fixture
-def nothing_loaded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def nothing_loaded(monkeypatch):
     """A process that has no kernels, and two threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -38,14 +37,12 @@ def nothing_loaded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize(
     "change", [SMALL, [*SMALL, LAMP, "optimize.parameters={density: {}, sigma_s: {}}"]]
 )
-def test_an_iteration_names_the_adjoints_that_it_launches(
-    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch, change: list[str]
-) -> None:
+def test_an_iteration_names_the_adjoints_that_it_launches(nothing_loaded, monkeypatch, change):
     use_engine("warp")
     launched = dict[Any, bool]()
     load = compiling.load
 
-    def note(kernel: Any, device: str) -> None:
+    def note(kernel, device):
         launched.setdefault(kernel, (kernel, device) in compiling._named)
         load(kernel, device)
 
@@ -59,20 +56,15 @@ def test_an_iteration_names_the_adjoints_that_it_launches(
     assert named == later | {"multigrid_iterate", "multigrid_prepare", "ordinates_light"}
 
 
-def fill_kernels() -> list[TextKernel]:
+def fill_kernels():
     return [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(5)]
 
 
-Load = Callable[[Any], None]
-
-
-def replace_compiler(monkeypatch: pytest.MonkeyPatch, load: Load) -> None:
+def replace_compiler(monkeypatch, load):
     monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: load(module))
 
 
-def test_who_needs_a_kernel_first_compiles_it(
-    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_needs_a_kernel_first_compiles_it(nothing_loaded, monkeypatch):
     """What nobody has begun, whoever was asked for it; for what was begun it waits.
 
     Those who were asked begin with what was named last.
@@ -80,7 +72,7 @@ def test_who_needs_a_kernel_first_compiles_it(
     first, second, third, fourth, fifth = (kernel.kernel for kernel in fill_kernels())
     may_end, threads = threading.Event(), dict[Any, list[str]]()
 
-    def compile(module: Any) -> None:
+    def compile(module):
         threads.setdefault(module, []).append(threading.current_thread().name)
         if module is first.module:
             has_begun.set()
@@ -104,10 +96,8 @@ def test_who_needs_a_kernel_first_compiles_it(
     assert threads[first.module] != [own] and [len(each) for each in threads.values()] == [1] * 5
 
 
-def test_what_another_thread_cannot_compile_is_an_error_here(
-    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(module: Any) -> None:
+def test_what_another_thread_cannot_compile_is_an_error_here(nothing_loaded, monkeypatch):
+    def fail(module):
         raise OSError("no compiler")
 
     replace_compiler(monkeypatch, fail)

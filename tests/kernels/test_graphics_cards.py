@@ -22,9 +22,7 @@ MOST_STACK = 1024
 
 
 @pytest.mark.slow
-def test_kernels_of_iterations_fit_into_registers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_of_iterations_fit_into_registers(tmp_path, monkeypatch):
     """Those of a plume, and where cameras and lamps are sought as well; each for one generation."""
     use_engine("warp")
     kernels = dict[Any, None]()

@@ -3,13 +3,11 @@
 import math
 import multiprocessing
 import threading
-from collections.abc import Callable
 
 import pytest
 import torch
 from media import half_empty, make_scene
 from scenes import cloud, mixture
-from torch import Tensor
 from twins import assert_same, differentiate, images_of, values_of
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -19,7 +17,6 @@ from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.picture import render_each
-from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -32,14 +29,14 @@ FIELDS = "density", "sigma_a", "sigma_s"
 VARIED = {cloud: (*FIELDS, "g"), mixture: (*FIELDS, "phase.g")}
 
 
-def reorder(tensor: Tensor) -> Tensor:
+def reorder(tensor):
     """The same numbers, stored as Fortran would."""
     axes = list(reversed(range(tensor.ndim)))
     return tensor.permute(axes).contiguous().permute(axes)
 
 
 @pytest.mark.parametrize("make", [cloud, mixture])
-def test_layout_in_memory_changes_nothing(make: Callable[[], Scene]):
+def test_layout_in_memory_changes_nothing(make):
     scene = make()
     values = values_of(scene, VARIED[make])
     known = differentiate("torch", images_of(scene), values)
@@ -48,9 +45,7 @@ def test_layout_in_memory_changes_nothing(make: Callable[[], Scene]):
 
 
 @pytest.mark.parametrize("make", [cloud, mixture])
-def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
-    make: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
-):
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(make, monkeypatch):
     # However few cells and pixels there are, threads share them.
     monkeypatch.setattr("ddrecon.diffusion.fused.passes.SMALL", 0)
     scene, threads, runs = make(), torch.get_num_threads(), []
@@ -67,7 +62,7 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_second_derivatives_are_refused(engine: str):
+def test_second_derivatives_are_refused(engine):
     """Rather than that parts of them are missing, whether the cotangent varies or not."""
     use_engine(engine)
     scene = cloud()
@@ -100,7 +95,7 @@ def test_what_inference_mode_made_serves_derivatives_later():
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("model", ["p1", "none"])
-def test_a_density_that_is_no_number_is_seen(engine: str, model: str):
+def test_a_density_that_is_no_number_is_seen(engine, model):
     use_engine(engine)
     density = half_empty(*SHAPE)
     density[2, 3, 4] = torch.nan
@@ -115,7 +110,7 @@ def test_a_density_that_is_no_number_is_seen(engine: str, model: str):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_light_through_what_is_no_number_is_none(engine: str):
+def test_light_through_what_is_no_number_is_none(engine):
     """Where the mass up to a cell is not a number, no kernel makes one of the light there."""
     use_engine(engine)
     scene = cloud()
@@ -131,10 +126,10 @@ def test_light_through_what_is_no_number_is_none(engine: str):
         assert bool((source.isnan() | ~is_unknown).all())
 
 
-def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
+def test_a_failing_share_waits_for_the_others(monkeypatch):
     like, started, done = torch.zeros(1), threading.Event(), threading.Event()
 
-    def fake(_kernel: object, _size: int, arguments: list[int], **_: object) -> None:
+    def fake(_kernel, _size, arguments, **_):
         if arguments[0] == 0:
             started.wait(10)
             raise ValueError("no")
@@ -157,5 +152,5 @@ def test_threads_are_there_after_a_fork():
     assert process.exitcode == 0
 
 
-def _ask_thread() -> None:
+def _ask_thread():
     launch._pool(2).submit(int).result(10)

@@ -1,6 +1,5 @@
 """Shares of a launch: each is done once, whichever thread does it."""
 
-from collections.abc import Iterator
 from threading import Event
 
 import pytest
@@ -15,7 +14,7 @@ HERE = torch.zeros(1)
 
 
 @pytest.fixture
-def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+def done(monkeypatch):
     """What launches did: first item, number of items, and the record."""
     calls: list[tuple[int, ...]] = []
     monkeypatch.setattr(launching, "_call", lambda *of: calls.append(of[2:5]))
@@ -24,7 +23,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 
 @pytest.fixture
-def busy() -> Iterator[None]:
+def busy():
     """While it lasts, no thread but that of the test does anything."""
     free = Event()
     waiting = [launching._pool(2).submit(free.wait) for _ in range(2)]

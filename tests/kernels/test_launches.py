@@ -4,7 +4,6 @@ import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -25,7 +24,7 @@ MOST_LAUNCHES = {"no round": 660, "a round": 950, "plume.yaml": 1_260}
 
 
 @pytest.fixture(scope="module")
-def launches() -> ModuleType:
+def launches():
     path = Path(__file__).parents[2] / "benchmarks" / "launches.py"
     sys.path.append(str(path.parent))  # of its neighbors
     spec = importlib.util.spec_from_file_location("launches", path)
@@ -38,7 +37,7 @@ def launches() -> ModuleType:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", MOST_LAUNCHES)
-def test_an_iteration_launches_and_waits_seldom(launches: ModuleType, case: str) -> None:
+def test_an_iteration_launches_and_waits_seldom(launches, case):
     """The paper's plume in one view, without and with a round; and three views in color."""
     use_engine("warp")
     with as_on_a_gpu():
@@ -53,7 +52,7 @@ def test_an_iteration_launches_and_waits_seldom(launches: ModuleType, case: str)
 
 
 @pytest.mark.slow
-def test_a_recorded_iteration_reads_twice(launches: ModuleType) -> None:
+def test_a_recorded_iteration_reads_twice(launches):
     """Losses with residuals, and the slope with what else the search decides by."""
     use_engine("warp")
     run = launches.begin_plume(12, 48, 1, "cpu")

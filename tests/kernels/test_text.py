@@ -26,11 +26,11 @@ FIELDS, WEIGHTS = random_values(2, 37), random_values(2, seed=1)
 
 
 @pytest.fixture(scope="module")
-def kernel() -> TextKernel:
+def kernel():
     return TextKernel("weighted_sum", 64, TEXT, DECLARED, "out is_large")
 
 
-def inputs(fields=FIELDS, shift: float = 0.0, length: int = 1) -> dict:
+def inputs(fields=FIELDS, shift=0.0, length=1):
     """For an item each, or for one with all 37."""
     return {
         "total": 37,
@@ -41,7 +41,7 @@ def inputs(fields=FIELDS, shift: float = 0.0, length: int = 1) -> dict:
     }
 
 
-def outputs() -> dict[str, torch.Tensor]:
+def outputs():
     return {
         "out": torch.empty(37, dtype=torch.float64),
         "is_large": torch.empty(37, dtype=torch.bool),
@@ -80,7 +80,7 @@ def test_each_share_writes_to_its_own(kernel):
 def test_threads_launch_the_same_kernel_at_once(kernel):
     """Each has a recorded launch for itself while it lasts."""
 
-    def run(seed: int) -> bool:
+    def run(seed):
         fields, results = random_values(2, 37, seed=seed), outputs()
         kernel.launch(37, inputs(fields), results, threads=1)
         return torch.allclose(results["out"], WEIGHTS @ fields, rtol=1e-14)

@@ -21,7 +21,7 @@ OF_EACH_HEADER = (
 
 
 @pytest.mark.slow
-def test_loops_become_vector_code(tmp_path: Path) -> None:
+def test_loops_become_vector_code(tmp_path):
     """Kernels are compiled anew as users have them, in a cache of their own."""
     found = subprocess.run(
         [sys.executable, "-m", "pytest", "-n", "0", "-s", *(TESTS / one for one in OF_EACH_HEADER)],

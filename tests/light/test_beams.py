@@ -3,7 +3,6 @@
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from media import (
     random_values,
     tensor,
 )
-from torch import Tensor
 
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.grid import Grid
@@ -28,7 +26,6 @@ from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sk
 from ddrecon.light.shear import sum_masses
 from ddrecon.lighting import fluence
 from ddrecon.medium.coefficients import (
-    Medium,
     Volume,
     backward_fraction,
     refine_medium,
@@ -38,18 +35,17 @@ from ddrecon.medium.coefficients import (
 )
 from ddrecon.numerics.sphere import sphere_quadrature
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
 SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
 
 
-def unit(direction: tuple[float, ...]) -> Tensor:
+def unit(direction):
     vector = torch.tensor(direction, dtype=torch.float64)
     return vector / vector.norm()
 
 
-def sum_mass_to_cells(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
+def sum_mass_to_cells(field, grid, direction):
     (entered,), (step,) = sum_masses(field, grid, direction[None], 0.0)
     return entered, step
 
@@ -101,7 +97,7 @@ def test_in_a_linear_field_the_mass_is_that_of_each_ray(direction):
 
 
 @pytest.mark.parametrize("direction", [*SLANTED, (0.9, 0.2, 0.02), (1.0, 1.0, 1.0)], ids=str)
-def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction: tuple[float, ...]):
+def test_in_an_even_block_the_mass_is_the_way_from_the_face(direction):
     """Up to the faces: where the light of two cells around comes by the same one, it is exact."""
     grid, travel = Grid((14, 12, 13), (0, 0, 0), (1.4, 1.1, 1.3)), unit(direction)
     places = torch.broadcast_tensors(*grid.centers(travel))
@@ -140,7 +136,7 @@ def test_what_comes_through_a_side_is_received():
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.4142, -0.5, 0.6)], ids=str)
-def test_entered_mass_has_both_derivatives(direction: tuple[float, ...]):
+def test_entered_mass_has_both_derivatives(direction):
     """By the field, and by a direction on whose sides it is the same formula."""
     grid, field = box_grid((3, 2, 3)), 0.5 + half_empty(1, 3, 2, 3)
     heading = unit(direction).requires_grad_(0.0 not in direction)
@@ -154,7 +150,7 @@ def test_entered_mass_has_both_derivatives(direction: tuple[float, ...]):
 AXES = (0.0, 0.0, -1.0), (0.3, -1.0, 0.2), (0.5, 0.4, 1.3)
 
 
-def length_in_box(direction: Tensor) -> float:
+def length_in_box(direction):
     """Of the line along `direction` (x, y, z) through the middle of a box 0.9 x 1.2 x 1."""
     half = tensor(0.45, 0.6, 0.5)
     return 2 * float((half / (direction / direction.norm()).abs()).min())
@@ -162,7 +158,7 @@ def length_in_box(direction: Tensor) -> float:
 
 @pytest.mark.parametrize("radius", [0.0, 0.03, 0.1])
 @pytest.mark.parametrize("axis", AXES)
-def test_cells_together_receive_the_power_of_a_beam(axis: tuple[float, ...], radius: float) -> None:
+def test_cells_together_receive_the_power_of_a_beam(axis, radius):
     """In an empty box, power times way; along z wherever in its cell the axis runs."""
     grid, direction = box_grid((16, 20, 18)), tensor(*axis)
     for shift in (0.0, 0.013, 0.03) if axis == AXES[0] else (0.0,):
@@ -173,7 +169,7 @@ def test_cells_together_receive_the_power_of_a_beam(axis: tuple[float, ...], rad
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_a_profile_is_the_mean_of_the_gaussian_over_each_cell(axis: tuple[float, ...]) -> None:
+def test_a_profile_is_the_mean_of_the_gaussian_over_each_cell(axis):
     grid, direction, radius = box_grid((4, 5, 6)), tensor(*axis), 0.4
     place = tensor(0.1, -0.05, 0.02)
     irradiance = profile_in(grid, place, direction, tensor(radius)[0])[0]
@@ -190,7 +186,7 @@ def test_a_profile_is_the_mean_of_the_gaussian_over_each_cell(axis: tuple[float,
 @pytest.mark.parametrize(
     "changes", [{}, {"g": 0.8, "transport_rounds": 1}, {"model": "none"}], ids=str
 )
-def test_a_very_wide_beam_is_a_directional_light(changes: dict[str, Any]) -> None:
+def test_a_very_wide_beam_is_a_directional_light(changes):
     direction, radius, irradiance = tensor(-0.4, -1.0, 0.3), 1e4, tensor(3.0, 2.0, 1.0)
     power = irradiance * math.pi * radius**2 / 2
     beam = BeamLight(tensor(0.0, 2.0, 0.0), direction, power, tensor(radius)[0])
@@ -202,7 +198,7 @@ def test_a_very_wide_beam_is_a_directional_light(changes: dict[str, Any]) -> Non
     torch.testing.assert_close(render(wide), render(sun), rtol=1e-6, atol=1e-9)
 
 
-def test_view_rays_see_what_a_thin_beam_scatters() -> None:
+def test_view_rays_see_what_a_thin_beam_scatters():
     """In thin air, from the side: power times cross section in all; three pixels to a cell."""
     density = torch.full((16, 18, 20), 1e-4, dtype=torch.float64)
     beam = BeamLight(tensor(0.02, 2.0, 0.07), tensor(0.0, -1.0, 0.0), tensor(2.0), tensor(0.0)[0])
@@ -217,13 +213,13 @@ def test_view_rays_see_what_a_thin_beam_scatters() -> None:
 IRRADIANCE = 3.0
 
 
-def in_unit_box(density: torch.Tensor, travel=(0.0, 0.0, 2.0), **changes: Any) -> Scene:
+def in_unit_box(density, travel=(0.0, 0.0, 2.0), **changes):
     grid = Grid(tuple(density.shape), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     medium = {"sigma_a": (0.5,), "sigma_s": (6.0,), "directional": (IRRADIANCE,)}
     return make_scene(density, grid=grid, travel=travel, **medium, **changes)
 
 
-def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> None:
+def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell():
     """What F and G lose in a cell is what scatters there and is absorbed, and the rest leaves."""
     torch.manual_seed(1)
     density, g = torch.rand(2, 9, 1, 1, dtype=torch.float64)
@@ -250,7 +246,7 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
     assert float(taken.sum()) == pytest.approx(IRRADIANCE * (1 - passed - reflected), rel=1e-12)
 
 
-def test_a_slanted_pair_in_an_even_box_takes_what_it_takes_of_each_ray() -> None:
+def test_a_slanted_pair_in_an_even_box_takes_what_it_takes_of_each_ray():
     """By the closed form of E8.11 for the depth of each, whichever face it enters by."""
     travel, taken = tensor(1.0, -0.6, 2.0), []
     for cells in (6, 12, 24):
@@ -273,7 +269,7 @@ def test_a_slanted_pair_in_an_even_box_takes_what_it_takes_of_each_ray() -> None
 
 
 @pytest.mark.parametrize("varied", ["g", "sigma_s"])
-def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
+def test_an_empty_cell_is_the_limit_of_thin_ones(varied):
     """So are derivatives there: what cells that are not there yet would turn back is known."""
     torch.manual_seed(2)
     density, share = torch.rand(2, 5, 4, 3, dtype=torch.float64)
@@ -285,7 +281,7 @@ def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
     else:
         volume.sigma_s = 6 * share[None]
 
-    def pair_at(least: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def pair_at(least):
         volume.density = density.clamp(min=least).requires_grad_()
         pair = follow_pair(scale_medium(volume, 3), scene.lights[0])
         both = torch.stack([pair.along, pair.against])
@@ -296,7 +292,7 @@ def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
         torch.testing.assert_close(empty, thin, rtol=1e-7, atol=1e-7)
 
 
-def test_what_a_beam_scatters_is_what_turns_back_and_the_rest() -> None:
+def test_what_a_beam_scatters_is_what_turns_back_and_the_rest():
     """In every moment: the backward peak is light that goes against the beam (E8.11)."""
     medium = scale_medium(in_unit_box(torch.ones(2, 1, 1).double(), g=-0.7).volume, 5)
     way, mean = torch.tensor([0.48, -0.6, 0.64]).double(), torch.ones(1, 2, 1, 1).double()
@@ -309,19 +305,17 @@ def test_what_a_beam_scatters_is_what_turns_back_and_the_rest() -> None:
     torch.testing.assert_close(rest + against, whole, rtol=1e-12, atol=1e-12)
 
 
-def medium_in(
-    grid: Grid, density: Tensor, g: float = 0.4, sigma=((0.5, 1.0), (3.0, 2.0))
-) -> Medium:
+def medium_in(grid, density, g=0.4, sigma=((0.5, 1.0), (3.0, 2.0))):
     sigma_a, sigma_s = (density.new_tensor(s) for s in sigma)
     return scale_medium(Volume(grid, density, sigma_a, sigma_s, density.new_tensor(g)))
 
 
-def received(grid: Grid, density: Tensor, lights: list, **medium) -> Tensor:
+def received(grid, density, lights, **medium):
     return receive_light(medium_in(grid, density, **medium), lights, degree=1).source
 
 
 @pytest.mark.parametrize("g", [0.4, -0.4])
-def test_in_even_columns_parts_of_cells_receive_what_cells_do(g: float):
+def test_in_even_columns_parts_of_cells_receive_what_cells_do(g):
     """Of a backward peak they receive pairs of beams."""
     grid, density = box_grid((4, 3, 2)), torch.full((4, 3, 2), 5.0, dtype=torch.float64)
     medium = scale_medium(Volume(grid, density, tensor(0.5, 1), tensor(3, 2), tensor(g)[0]), 3)
@@ -333,7 +327,7 @@ def test_in_even_columns_parts_of_cells_receive_what_cells_do(g: float):
 
 
 @pytest.mark.parametrize("zenith", [10.0, 60.0, 75.0])
-def test_a_thick_uneven_layer_receives_all_light_of_a_slanted_sun(zenith: float):
+def test_a_thick_uneven_layer_receives_all_light_of_a_slanted_sun(zenith):
     """Cells are 5 times as wide as high, and up to 18 optical depths wide; nothing gets through."""
     grid = Grid((24, 6, 8), (0, 0, 0), (0.48, 0.6, 0.8), periodic=(1, 2))
     z, y, x = (center / 0.2 for center in grid.centers(tensor(0)))

@@ -1,15 +1,13 @@
 """Light of beams, lamps and skies, and E2.3, by fused kernels is torch's, also at kinks."""
 
 import itertools
-from pathlib import Path
 
 import pytest
 import torch
 from graphics_cards import assert_compiles
 from media import box_grid, half_empty, random_values, tensor
 from scenes import cloud, mixture, sky
-from torch import Tensor
-from twins import Function, Tensors, assert_twins, values_of
+from twins import assert_twins, values_of
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
@@ -20,7 +18,6 @@ from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_
 from ddrecon.light.shear import sum_masses
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
-from ddrecon.scene import Scene
 from ddrecon.variables.values import variable_names, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -32,7 +29,6 @@ from ddrecon.light.fused.receive import receive_kernel
 from ddrecon.light.fused.shear import _KERNELS, shear_kernel
 
 pytestmark = pytest.mark.slow
-Shape = tuple[int, int, int]
 DIRECTIONS = [
     *[(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)],  # along axes
     *[(1.0, -1.0, 1.0), (-1.0, 0.5, 0.5), (1.0, 0.0, -1.0)],  # through centers
@@ -41,10 +37,10 @@ DIRECTIONS = [
 SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
 
 
-def masses_in(grid: Grid) -> Function:
+def masses_in(grid):
     """Mass and path of a beam, as a function of field, heading and bound."""
 
-    def find(values: Tensors) -> list[Tensor]:
+    def find(values):
         way = torch.nn.functional.normalize(values["heading"], dim=0)
         (entered,), (step,) = sum_masses(values["field"], grid, way[None], values["bound"])
         return [entered, step]
@@ -53,7 +49,7 @@ def masses_in(grid: Grid) -> Function:
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
-def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...]):
+def test_masses_and_their_derivatives_are_those_of_torch(direction):
     """Also where places lie exactly on cells' centers: there the slopes beyond them."""
     for shape, bound, is_cubic in itertools.product(SHAPES, (0.0, 1.7), (True, False)):
         corner = tuple(0.2 * cells for cells in shape) if is_cubic else (1.25, 1.3, 0.9)
@@ -64,7 +60,7 @@ def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float,
 
 
 @pytest.mark.parametrize("along", range(3))
-def test_rows_longer_than_a_block(along: int):
+def test_rows_longer_than_a_block(along):
     shape = tuple(262 if axis == along else 3 for axis in range(3))
     # Slopes that no small fraction is: through a center of a cell derivatives have a kink.
     heading = [0.2357, -0.3163, 0.4142]
@@ -77,10 +73,10 @@ def test_rows_longer_than_a_block(along: int):
 # --- lights in a medium ---
 
 
-def light_of(scene: Scene, degree: int) -> Function:
+def light_of(scene, degree):
     """Masses of beams, and all moments of the light not yet scattered, by variables of `scene`."""
 
-    def find(values: Tensors) -> list[Tensor]:
+    def find(values):
         changed = with_values(scene, values)
         medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
         source = receive_light(medium, lights, degree).source
@@ -91,9 +87,7 @@ def light_of(scene: Scene, degree: int) -> Function:
     return find
 
 
-def assert_light_twins(
-    scene: Scene, degree: int = 1, error: float = 1e-11, changed: Tensors | None = None
-) -> None:
+def assert_light_twins(scene, degree=1, error=1e-11, changed=None):
     """By all that has a part in it: of a light without direction a map does not turn."""
     names = [n for n in variable_names(scene) if not n.startswith(("views.", "sigma_t", "albedo"))]
     names = [name for name in names if degree or not name.endswith("rotation")]
@@ -146,7 +140,7 @@ def test_sums_of_a_part_of_the_cells_at_a_time_are_those_of_all(monkeypatch):
 # --- E2.3 towards a camera ---
 
 
-def make_light(shape: Shape, colors: int, degree: int) -> Tensor:
+def make_light(shape, colors, degree):
     """phi that is dark in parts, and so directed that E2.3 is of either sign."""
     light = random_values((degree + 1) ** 2, colors, *shape, seed=11) * half_empty(*shape, seed=2)
     light[1:4] = 6 / 3**0.5 * (light[1:4] - 0.1)
@@ -154,10 +148,10 @@ def make_light(shape: Shape, colors: int, degree: int) -> Tensor:
     return light
 
 
-def radiance_in(shape: Shape, is_eye: bool, degree: int = 1) -> Function:
+def radiance_in(shape, is_eye, degree=1):
     """E2.3 as a function of light, g and place; the camera is an eye inside the box, or far off."""
 
-    def find(values: Tensors) -> list[Tensor]:
+    def find(values):
         point, density = values["point"], half_empty(*shape).to(values["light"])
         rays = Rays(point[None], -point[None], point if is_eye else None)
         sigma = density.new_ones(1)
@@ -171,7 +165,7 @@ def radiance_in(shape: Shape, is_eye: bool, degree: int = 1) -> Function:
 @pytest.mark.parametrize(
     ("shape", "g"), [((5, 7, 19), 0.4), ((5, 7, 19), -0.4), ((1, 4, 3), 0.0), ((1, 1, 1), 0.4)]
 )
-def test_radiance_and_cotangents_are_those_of_torch(shape: Shape, g: float):
+def test_radiance_and_cotangents_are_those_of_torch(shape, g):
     for is_eye, degree, colors in itertools.product((False, True), (0, 1), (1, 3)):
         values = {
             "light": make_light(shape, colors, degree),
@@ -190,7 +184,7 @@ def test_radiance_and_cotangents_are_those_of_torch(shape: Shape, g: float):
 @pytest.mark.parametrize(
     ("degree", "has_more"), [(1, True), (2, False), (3, True), (5, False), (7, True)]
 )
-def test_light_of_any_degree(degree: int, has_more: bool):
+def test_light_of_any_degree(degree, has_more):
     """Towards an eye inside the box, and with radiance besides, bent as a whole."""
     shape = (3, 4, 17)
     values = {"light": make_light(shape, 3, degree), "g": tensor(0.4)[0]}
@@ -199,7 +193,7 @@ def test_light_of_any_degree(degree: int, has_more: bool):
     assert_twins(radiance_in(shape, True, degree), values, 1e-11, least=1e-3)
 
 
-def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+def test_kernels_compile_for_graphics_cards(tmp_path):
     kernels = [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
     kernels += [way_kernel("", 32), way_kernel("long", 32), receive_kernel("tangent", 32)]
     outgoing = RowFunction(HEADER, "Outgoing<3, 1, 1>", ((3, 1, 1, 1),), 1, VIEW, GIVEN)

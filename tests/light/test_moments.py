@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torch import Tensor
 
 from ddrecon.light.moments import (
     MARGIN,
@@ -19,7 +18,7 @@ from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 DTYPES = [torch.float32, torch.float64]
 
 
-def along_z(mean: Tensor, flux: Tensor) -> Tensor:
+def along_z(mean, flux):
     """What `mean` and `flux` along z send along z."""
     nothing = torch.zeros_like(flux)
     one = torch.ones((), dtype=mean.dtype)
@@ -27,7 +26,7 @@ def along_z(mean: Tensor, flux: Tensor) -> Tensor:
     return radiance_along(phi, (one, one * 0, one * 0))
 
 
-def fluxes(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
+def fluxes(*values, dtype=torch.float64):
     return torch.tensor(values, dtype=dtype).view(1, 1, 1, -1)
 
 
@@ -49,7 +48,7 @@ def test_without_a_flux_only_what_is_below_zero_is_changed():
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_radiance_rises_from_zero_without_a_jump_in_value_or_slope(dtype: torch.dtype):
+def test_radiance_rises_from_zero_without_a_jump_in_value_or_slope(dtype):
     """Towards both ends of the bend, r = m and r = -m with m = MARGIN (1 + |flux|), mean 1."""
     ends = [-(1 - MARGIN) / (1 + MARGIN), -(1 + MARGIN) / (1 - MARGIN)]
     step = 1e-4
@@ -65,7 +64,7 @@ def test_radiance_rises_from_zero_without_a_jump_in_value_or_slope(dtype: torch.
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("scale", [0.0, 1e-37, 1e-20, 1e20])
-def test_values_and_slopes_are_finite_whatever_the_unit(scale: float, dtype: torch.dtype):
+def test_values_and_slopes_are_finite_whatever_the_unit(scale, dtype):
     flux = (scale * fluxes(-2.0, -1.0, -0.985, 0.0, 5.0, dtype=dtype)).requires_grad_()
     mean = torch.full_like(flux, scale).detach().requires_grad_()
     radiance = along_z(mean, flux)

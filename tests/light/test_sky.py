@@ -18,7 +18,6 @@ from media import (
     random_values,
     tensor,
 )
-from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, look_at
@@ -36,34 +35,32 @@ from ddrecon.light.sky import (
     pixel_moments,
     refine_map,
 )
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
 
 SHAPE = (5, 4, 6)
 
 
-def uneven(height: int, width: int, seed: int = 0) -> Tensor:
+def uneven(height, width, seed=0):
     """A map [3, h, w] with one small bright spot in it, which is a sun."""
     radiance = random_values(3, height, width, seed=seed)
     radiance[:, height // 3, width // 5] += 3 * height * width
     return radiance
 
 
-def banded(height: int, width: int) -> Tensor:
+def banded(height, width):
     """A map [3, h, w] without suns, bright on one side and dark on the other."""
     around = (torch.arange(width, dtype=torch.float64) + 0.5) * (2 * math.pi / width)
     return (1 + torch.sin(around)).expand(3, height, width) + uneven(height, width).clamp(max=1)
 
 
-def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
+def center(row, column, height, width):
     """The direction (x, y, z) of a pixel, from -z over +x around."""
     down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
     return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
 
 
-def hot_pixel(
-    height: int, width: int, row: int, column: int
-) -> tuple[EnvironmentLight, DirectionalLight]:
+def hot_pixel(height, width, row, column):
     """A map black but for one pixel, and the parallel light it is, by its solid angle."""
     radiance = torch.zeros(3, height, width, dtype=torch.float64)
     radiance[:, row, column] = torch.tensor([300.0, 200.0, 100.0])
@@ -73,12 +70,12 @@ def hot_pixel(
     return light_of(radiance), sun
 
 
-def relative_error(found: Tensor, expected: Tensor) -> float:
+def relative_error(found, expected):
     return float((found - expected).norm() / expected.norm())
 
 
 @pytest.mark.parametrize("count", [1, 7, 48])
-def test_directions_are_spread_evenly(count: int):
+def test_directions_are_spread_evenly(count):
     directions = fibonacci_sphere(count)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-14)
     closest = np.sort(directions @ directions.T, axis=1)[:, -2] if count > 1 else np.array([-1.0])
@@ -87,9 +84,7 @@ def test_directions_are_spread_evenly(count: int):
 
 @pytest.mark.parametrize("directions", [1, 6, 48])
 @pytest.mark.parametrize("size", [(2, 3), (5, 8), (32, 64)], ids=str)
-def test_power_and_first_moment_of_a_map_are_those_of_its_parts(
-    size: tuple[int, int], directions: int
-):
+def test_power_and_first_moment_of_a_map_are_those_of_its_parts(size, directions):
     """All that a map without suns sends in, and the vector along which it goes."""
     light = light_of(random_values(3, *size), scale=1.3, rotation=25.0, directions=directions)
     (ambient, sky) = decompose_map(light)
@@ -120,7 +115,7 @@ def test_there_are_at_most_four_suns():
 
 
 @pytest.mark.parametrize("directions", [1, 2, 6, 48, 200])
-def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int):
+def test_a_constant_map_is_ambient_light_whatever_the_directions(directions):
     color = torch.tensor([0.7, 0.2, 0.0], dtype=torch.float64)
     even = color.view(3, 1, 1).expand(3, 6, 8)
     ambient, sky = decompose_map(light_of(even, directions=directions))
@@ -128,7 +123,7 @@ def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int
 
 
 @pytest.mark.parametrize("place", [(32, 64, 16, 0), (16, 32, 12, 31)], ids=str)
-def test_a_hot_pixel_is_a_directional_light(place: tuple[int, int, int, int]):
+def test_a_hot_pixel_is_a_directional_light(place):
     scene = make_scene(half_empty(*SHAPE), g=0.6)
     environment, directional = hot_pixel(*place)
     scene.render = replace(scene.render, background=False)
@@ -179,7 +174,7 @@ def test_memory_does_not_grow_with_directions():
     density = random_values(16, 16, 16).requires_grad_()
     medium = scale_medium(replace(make_scene(density.detach(), g=0.3).volume, density=density))
 
-    def sky(directions: int) -> Tensor:
+    def sky(directions):
         parts = decompose_map(light_of(uneven(16, 32).requires_grad_(), directions=directions))
         return sum_unscattered_sky(medium, parts, degree=1).sum()
 
@@ -199,7 +194,7 @@ def test_under_a_black_map_images_have_finite_derivatives_by_every_number():
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
 
 
-def directions(count: int, seed: int = 0) -> Tensor:
+def directions(count, seed=0):
     """Unit directions (x, y, z)."""
     generator = torch.Generator().manual_seed(seed)
     return torch.nn.functional.normalize(
@@ -207,14 +202,14 @@ def directions(count: int, seed: int = 0) -> Tensor:
     )
 
 
-def seen(light: EnvironmentLight, *direction: float) -> list[float]:
+def seen(light, *direction):
     """What is seen along one direction (x, y, z), of any length."""
     vector = torch.nn.functional.normalize(light.radiance.new_tensor(direction), dim=0)
     return environment_radiance(light, array_order(vector)[None])[:, 0].tolist()
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)
-def test_a_pixel_is_seen_in_its_direction(height: int, width: int):
+def test_a_pixel_is_seen_in_its_direction(height, width):
     light = light_of(random_values(2, height, width))
     for row, column in ((1, 0), (1, width - 1), (height - 2, 1)):
         assert seen(light, *center(row, column, height, width)) == pytest.approx(
@@ -229,7 +224,7 @@ def test_between_pixels_radiance_is_their_mean_also_across_the_seam():
 
 
 @pytest.mark.parametrize(("up", "way"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
-def test_straight_up_and_down_are_the_first_and_last_row(up: str, way: tuple[int, int, int]):
+def test_straight_up_and_down_are_the_first_and_last_row(up, way):
     rows = torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64)
     light = light_of(rows.view(1, 3, 1).expand(1, 3, 4), rotation=20.0, up=up)
     assert seen(light, *way) == pytest.approx([2.0])
@@ -237,7 +232,7 @@ def test_straight_up_and_down_are_the_first_and_last_row(up: str, way: tuple[int
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
-def test_moments_integrate_the_bilinear_map(height: int, width: int):
+def test_moments_integrate_the_bilinear_map(height, width):
     """Against a sum over 300 x 600 directions."""
     light = light_of(random_values(1, height, width))
     rows, columns = 300, 600
@@ -253,7 +248,7 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int):
 
 
 @pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
-def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
+def test_a_refined_map_is_the_same_function(size):
     radiance, ways = random_values(2, 7, 5), array_order(directions(100))
     fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
@@ -262,11 +257,11 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
-def test_what_is_seen_has_both_derivatives(name: str):
+def test_what_is_seen_has_both_derivatives(name):
     values = {"radiance": random_values(2, 4, 5), "scale": random_values()}
     values |= {"rotation": 100 * random_values(seed=1), "direction": array_order(directions(6))}
 
-    def look(value: Tensor) -> Tensor:
+    def look(value):
         *light, direction = (values | {name: value}).values()
         return environment_radiance(EnvironmentLight(*light), direction)
 
@@ -287,27 +282,27 @@ def test_straight_up_has_finite_derivatives():
 OUTSIDE, INSIDE = (0.3, 1.7, 1.1), (0.11, 0.13, 0.17)
 
 
-def light_at(position: tuple[float, ...]) -> PointLight:
+def light_at(position):
     return PointLight(tensor(*position), tensor(2.0))
 
 
-def medium_of(grid: Grid, density: Tensor, g: float = 0.4) -> Medium:
+def medium_of(grid, density, g=0.4):
     return scale_medium(Volume(grid, density, tensor(0.5), tensor(3.0), tensor(g)[0]))
 
 
-def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
+def offsets(grid, position):
     """From the light to the cell centers, `[z, y, x, 3]` in array order."""
     axes = torch.broadcast_tensors(*grid.centers(tensor(0)))
     return torch.stack(axes, -1) - tensor(*position[::-1])
 
 
-def cell_center(grid: Grid, *cell: int) -> tuple[float, ...]:
+def cell_center(grid, *cell):
     """The center (x, y, z) of a cell (z, y, x)."""
     return tuple(offsets(grid, (0.0, 0.0, 0.0))[cell].flip(0).tolist())
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
-def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
+def test_without_a_medium_light_falls_with_the_square_of_the_distance(position):
     """Everywhere but in the light's own cell."""
     grid = box_grid((10, 12, 9))
     empty = medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64))
@@ -325,7 +320,7 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: 
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
-def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
+def test_in_a_homogeneous_box_depth_is_path_length(position):
     grid = box_grid((7, 6, 5))
     even = medium_of(grid, torch.ones(grid.shape, dtype=torch.float64))
     beam = follow_point_light(even, light_at(position))
@@ -354,7 +349,7 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
 
 
 @pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])
-def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
+def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where):
     camera = make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
     scene = make_scene(half_empty(*SHAPE), g=0.4, camera=camera)
     grid = scene.volume.grid

@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import pytest
 import torch
 from media import box_grid, half_empty, make_camera, make_scene, march_rays, random_values
 from scenes import VIEWS
-from torch import Tensor
-from twins import Tensors, assert_same, assert_transposes, differentiate, images_of, values_of
+from twins import assert_same, assert_transposes, differentiate, images_of, values_of
 
 from ddrecon.cameras import Rays, cast_rays
 from ddrecon.engine import use_engine
@@ -27,7 +25,6 @@ from ddrecon.march.samplers import (
 from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import with_values
 
@@ -36,7 +33,7 @@ TRAVEL = torch.tensor([-0.6, 0.8, 0.0], dtype=torch.float64)
 POSITION = torch.tensor([0.0, 0.1, 4.0], dtype=torch.float64)
 
 
-def emission_of(diffuse: Tensor, *masses: Tensor) -> OutgoingLight:
+def emission_of(diffuse, *masses):
     """A thin medium with some diffuse light, one directional and one point light."""
     one = torch.ones(1, dtype=torch.float64)
     density = torch.ones(GRID.shape, dtype=torch.float64)
@@ -50,14 +47,14 @@ def emission_of(diffuse: Tensor, *masses: Tensor) -> OutgoingLight:
     return OutgoingLight(GRID, *matter, beams, diffuse, medium.seen, medium.peak)
 
 
-def linear(*point: Tensor) -> Tensor:
+def linear(*point):
     return 2 + 0.5 * point[0] - 0.7 * point[1] + 0.3 * point[2]
 
 
 @pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("view", [{"half_width": 0.1}, VIEWS["inside"]], ids=["far", "inside"])
-def test_linear_light_in_a_thin_medium_is_summed_exactly(engine: str, steps: int, view: dict):
+def test_linear_light_in_a_thin_medium_is_summed_exactly(engine, steps, view):
     """kappa_s times the length in the box times the light in its middle."""
     use_engine(engine)
     rays = cast_rays(make_camera(size=(5, 6), **view))
@@ -71,7 +68,7 @@ def test_linear_light_in_a_thin_medium_is_summed_exactly(engine: str, steps: int
 
 
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
-def test_masses_are_zero_where_light_enters_and_others_go_on(axis: int | None):
+def test_masses_are_zero_where_light_enters_and_others_go_on(axis):
     """Constant light stays constant, and so does matter; linear masses are linear where unlit."""
     mass = linear(*GRID.centers(TRAVEL))[None]
     fields = extend_fields(emission_of(torch.full_like(mass, 3.0), mass, mass), axis)
@@ -89,7 +86,7 @@ def test_masses_are_zero_where_light_enters_and_others_go_on(axis: int | None):
 
 
 @pytest.mark.parametrize("sampling", [RaySampling(None, longest=1.0), RaySampling(0)], ids=str)
-def test_up_to_faces_masses_are_linear(sampling: RaySampling):
+def test_up_to_faces_masses_are_linear(sampling):
     """From the outermost centers on, where inside they are of third order."""
     outgoing = emission_of(*random_values(2, 1, *GRID.shape, seed=1))
     sampler, (z, y, x) = Sampler(outgoing, sampling, 3), GRID.centers(TRAVEL)
@@ -135,7 +132,7 @@ def test_light_lacks_as_much_on_faces_however_far_fields_are_extended():
 
 @pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
-def test_extended_fields_have_both_derivatives(axis: int | None, engine: str):
+def test_extended_fields_have_both_derivatives(axis, engine):
     """By light, by masses, and by where it comes from; some of what goes on would be negative.
 
     And by what thick cells receive, of which less comes in than goes out.
@@ -145,7 +142,7 @@ def test_extended_fields_have_both_derivatives(axis: int | None, engine: str):
     backward = random_values(1, cells_at_faces(GRID, got).shape[-1], seed=5)
     direction, position = TRAVEL + 0.05, torch.tensor([-0.6, 0.1, 0.2], dtype=torch.float64)
 
-    def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+    def extend(diffuse, *rest):
         masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
         outgoing = emission_of(diffuse, *masses)
         received = receive_at_faces(GRID, rest[5].expand(4, -1, -1, -1, -1))
@@ -167,7 +164,7 @@ PACKETS, RAYS = ["density", "g"], ["density", "views.view.camera"]
 TWO_STEPS, LATTICE = {"steps_per_voxel": 2}, {"tolerance": 0.05}
 
 
-def two_blobs() -> Tensor:
+def two_blobs():
     """A support that rays enter twice, or once, or not at all."""
     support = torch.zeros(SHAPE, dtype=torch.float64)
     support[0:2, 2:5, 2:6] = 1
@@ -175,7 +172,7 @@ def two_blobs() -> Tensor:
     return support
 
 
-def scene_with(support: Tensor | None, settings: dict, is_gray: bool = False, **view: Any) -> Scene:
+def scene_with(support, settings, is_gray=False, **view):
     """A scene of which density lies in `two_blobs`, whether it is told so or not."""
     camera = make_camera(**({"size": (9, 10), "half_width": 0.4} | view))
     density = half_empty(*SHAPE) * two_blobs()
@@ -192,7 +189,7 @@ ENGINES = ["torch", pytest.param("warp", marks=pytest.mark.slow)]
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("settings", [{}, TWO_STEPS, LATTICE], ids=str)
 @pytest.mark.parametrize("names", [PACKETS, RAYS], ids=["packets", "rays"])
-def test_images_and_derivatives_are_those_without_it(engine: str, settings: dict, names: list[str]):
+def test_images_and_derivatives_are_those_without_it(engine, settings, names):
     """But for those by the density outside, which are 0, and changes of which nobody sees."""
     support, size = two_blobs(), (30, 31) if settings == LATTICE else (9, 10)
     without, within = (
@@ -202,7 +199,7 @@ def test_images_and_derivatives_are_those_without_it(engine: str, settings: dict
     derivatives = differentiate(engine, images_of(within), values, has_tangent=True)
     assert_transposes(derivatives, values)
 
-    def show(values: Tensors) -> list[Tensor]:
+    def show(values):
         """Without a support, of which the density outside varies as little as with it."""
         density = values["density"] * support + (values["density"] * (1 - support)).detach()
         return images_of(without)(values | {"density": density})
@@ -236,7 +233,7 @@ def test_what_it_leaves_out_is_not_walked():
     rays, ends = sight.rays, vars(sight.crossing).values()
     bundle = pack_rays(grid, sight.sampling.axis, rays.origin, rays.direction, *ends).bundle
 
-    def count(support: Tensor) -> int:
+    def count(support):
         bits = find_walked(support_of_planes(support, sight.sampling, 1), planes, bundle)
         return sum(number.bit_count() for number in bits.flatten().tolist())
 

@@ -1,19 +1,15 @@
 """The view-ray integral by fused kernels is torch's, in values, adjoints and tangents."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from graphics_cards import assert_compiles
 from media import half_empty, make_camera, make_scene, random_values
-from torch import Tensor
 from twins import assert_render_twins, differentiate, images_of, values_of
 
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
-from ddrecon.scene import Scene
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, Rayleigh, TwoLobe
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused import kernels
@@ -29,7 +25,7 @@ POINT = ["lights.1.position", "lights.1.intensity"]
 POSE = ["views.view.camera"]
 
 
-def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:
+def scene_of(kind, view, dtype=torch.float64, size=9):
     """A scene with a directional light, `kind` of medium and lights, seen by one camera."""
     density = half_empty(*SHAPE, dtype=dtype)
     tensor, camera = density.new_tensor, make_camera(size=(size, size + 1), dtype=dtype, **view)
@@ -51,7 +47,7 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
     return scene
 
 
-def phases(density: Tensor) -> dict[str, PhaseFunction]:
+def phases(density):
     """Both signs of g; two lobes, by color or backward; or weights that colors share."""
     tensor, numbers = density.new_tensor, random_values(*SHAPE, seed=7, dtype=density.dtype)
     by_color = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
@@ -92,7 +88,7 @@ EMISSIONS = [
         for kind, view, names in EMISSIONS
     ],
 )
-def test_images_and_derivatives_are_those_of_torch(kind: str, view: dict, names: list[str]):
+def test_images_and_derivatives_are_those_of_torch(kind, view, names):
     """With tangents of the media whose tangents `tests/test_engines.py` does not try."""
     has_tangent = kind == "lobes by color" or "by cell" in kind
     assert_render_twins(scene_of(kind, view), names, has_tangent=has_tangent)
@@ -107,9 +103,7 @@ def test_lattices_of_rays_are_marched_as_well():
 @pytest.mark.parametrize(
     ("dtype", "half_width"), [(torch.float32, 0.2), (torch.float64, 0.4)], ids=str
 )
-def test_packets_read_and_write_whole_rows(
-    eye: tuple[float, float, float], dtype: torch.dtype, half_width: float
-):
+def test_packets_read_and_write_whole_rows(eye, dtype, half_width):
     """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it."""
     camera = make_camera(size=(24, 33), dtype=dtype, half_width=half_width, eye=eye)
     scene = make_scene(half_empty(18, 21, 19, dtype=dtype), g=0.5, camera=camera)
@@ -118,7 +112,7 @@ def test_packets_read_and_write_whole_rows(
 
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
-def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
+def test_derivatives_by_rays_through_centers_of_cells(eye):
     """There slopes are those beyond centers; from all sides, by packets of rows or columns."""
     is_slanted = eye[1] != 0
     camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=is_slanted)
@@ -129,7 +123,7 @@ def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, f
     assert_render_twins(scene, POSE, has_tangent=True)
 
 
-def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+def test_kernels_compile_for_graphics_cards(tmp_path):
     """Some of all kernels: each takes seconds."""
     layout = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)

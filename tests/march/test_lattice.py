@@ -7,14 +7,12 @@ import pytest
 import torch
 from media import assert_image_derivatives, box_grid, make_camera, make_scene, random_values
 from scenes import VIEWS
-from torch import Tensor
 
-from ddrecon.cameras import Camera, Rays, cast_rays
+from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid
 from ddrecon.march.samplers import choose_sampling, cross_box
-from ddrecon.march.sight import Lattice, choose_lattice, interpolate, look_through
+from ddrecon.march.sight import choose_lattice, interpolate, look_through
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
 
@@ -28,7 +26,7 @@ each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys
 INTERPOLATED, OWN = RenderSettings(tolerance=1.0), RenderSettings(tolerance=0.0)
 
 
-def blob(grid: Grid) -> Tensor:
+def blob(grid):
     center = torch.zeros((), dtype=torch.float64)
     return 3 * torch.exp(-12 * sum(axis**2 for axis in grid.centers(center)))
 
@@ -37,7 +35,7 @@ def blob(grid: Grid) -> Tensor:
 def scene_of():
     """A blob in a small grid before light from behind, in many more pixels than rays tell apart."""
 
-    def scene(view: dict, **changes) -> Scene:
+    def scene(view, **changes):
         camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
         density, changes = blob(box_grid((6, 8, 7))), {"g": 0.3} | changes
         return make_scene(density, ambient=(0.4,), camera=camera, **changes)
@@ -45,7 +43,7 @@ def scene_of():
     return scene
 
 
-def lattice_of(scene: Scene) -> tuple[Lattice, Rays, int]:
+def lattice_of(scene):
     """The lattice for a scene's camera, the rays of that which hit the box, and the axis."""
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
@@ -53,13 +51,13 @@ def lattice_of(scene: Scene) -> tuple[Lattice, Rays, int]:
     return choose_lattice(grid, axis, hitting), hitting, axis
 
 
-def images(scene: Scene) -> tuple[Tensor, Tensor]:
+def images(scene):
     """By the lattice wherever it is possible, and without."""
     return render(replace(scene, render=INTERPOLATED)), render(replace(scene, render=OWN))
 
 
 @each_camera
-def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
+def test_pixels_are_placed_among_the_rays_of_the_lattice(view, scene_of):
     """In the plane through the middle of the box, which both cross, and anywhere along them."""
     scene = scene_of(view)
     lattice, hitting, axis = lattice_of(scene)
@@ -76,7 +74,7 @@ def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
 
 
 @each_camera
-def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
+def test_pixels_keep_to_the_tolerance(view, scene_of):
     """Fewer pixels are interpolated as the tolerance falls; the RMS error stays below it."""
     scene = scene_of(view)
     own, errors = render(replace(scene, render=OWN)), []
@@ -99,14 +97,12 @@ def test_subpixels_share_a_lattice(scene_of):
 
 
 @pytest.mark.parametrize("view", [VIEWS["inside"], VIEWS["grazing"], {"size": (4, 5)}], ids=str)
-def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
-    view: dict, scene_of
-):
+def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(view, scene_of):
     assert torch.equal(*images(scene_of(view)))
 
 
 @pytest.mark.parametrize("view", ["oblique", "orthographic"])
-def test_derivatives_are_those_of_the_interpolated_image(view: str, scene_of):
+def test_derivatives_are_those_of_the_interpolated_image(view, scene_of):
     """By density and camera, in both modes as by central differences."""
     scene = replace(scene_of(CAMERAS[view]), render=INTERPOLATED)
     assert_image_derivatives(scene, ("density", "views.view.camera"))
@@ -121,7 +117,7 @@ def test_an_empty_volume_passes_derivatives_to_every_cell(scene_of):
 
 
 @pytest.mark.parametrize("size", [1.0, 1000.0])
-def test_rays_along_an_axis_that_miss_are_lattice_rays_in_any_unit(size: float, scene_of):
+def test_rays_along_an_axis_that_miss_are_lattice_rays_in_any_unit(size, scene_of):
     scene = scene_of({"eye": (0.0, 0.0, 5.0 * size), "is_perspective": False, "half_width": size})
     grid = Grid((6, 8, 7), (-size / 2,) * 3, (size / 2,) * 3)
     volume = replace(scene.volume, grid=grid, density=(blob(box_grid((6, 8, 7))) / size).float())
@@ -132,11 +128,11 @@ def test_rays_along_an_axis_that_miss_are_lattice_rays_in_any_unit(size: float, 
 GRID, SETTINGS = box_grid((5, 6, 7)), RenderSettings()
 
 
-def camera_of(**kind) -> Camera:
+def camera_of(**kind):
     return make_camera(size=(6, 7), **kind)
 
 
-def scene_seen_by(camera: Camera) -> Scene:
+def scene_seen_by(camera):
     return make_scene(random_values(*GRID.shape), camera=camera, ambient=(0.3,))
 
 

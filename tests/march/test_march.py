@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,6 @@ from media import (
     tensor,
 )
 from scenes import VIEWS
-from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from ddrecon.cameras import Rays, cast_rays
@@ -28,7 +26,6 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import follow_lights
 from ddrecon.lighting import send, solve_light
 from ddrecon.march import integral as march_module
@@ -39,13 +36,12 @@ from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, SeenPhase, TwoLobe
 from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
 each_camera = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
 
-def emission_of(grid: Grid, density: Tensor) -> OutgoingLight:
+def emission_of(grid, density):
     """A medium under one oblique beam and some smooth diffuse light that grows along x."""
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
     numbers = map(density.new_tensor, ([0.5], [2.0, 3.0], 0.3))
@@ -55,12 +51,12 @@ def emission_of(grid: Grid, density: Tensor) -> OutgoingLight:
     return OutgoingLight(grid, *matter, beams, diffuse, medium.seen, medium.peak)
 
 
-def every_ray(steps: int) -> RenderSettings:
+def every_ray(steps):
     """Settings by which all rays are marched themselves."""
     return RenderSettings(steps_per_voxel=steps, tolerance=0.0)
 
 
-def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
+def chord(grid, origin, direction):
     """The length of one ray inside the box, in front of its origin, face by face."""
     near, far = 0.0, math.inf
     for low, high, o, d in zip(grid.lower, grid.upper, origin, direction, strict=True):
@@ -72,14 +68,14 @@ def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
     return max(far - near, 0.0)
 
 
-def chords(grid: Grid, bundle: Rays) -> Tensor:
+def chords(grid, bundle):
     pairs = zip(bundle.origin.tolist(), bundle.direction.tolist(), strict=True)
     return bundle.origin.new_tensor([chord(grid, *pair) for pair in pairs])
 
 
 @each_camera
 @pytest.mark.parametrize("steps", [1, 3])
-def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
+def test_a_homogeneous_box_attenuates_by_its_chord(view, steps):
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera(size=(7, 6), **view))
     outgoing = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
     transmittance = march_rays(outgoing, bundle, every_ray(steps))[1]
@@ -90,7 +86,7 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
 
 
 @each_camera
-def test_rays_that_miss_the_box_see_nothing(view: dict):
+def test_rays_that_miss_the_box_see_nothing(view):
     grid = box_grid((3, 5, 4))
     bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
     outgoing = emission_of(grid, 0.1 + half_empty(*grid.shape))
@@ -117,12 +113,12 @@ def test_a_box_behind_the_camera_is_not_seen():
 
 
 @each_camera
-def test_chunks_do_not_matter(view: dict, monkeypatch):
+def test_chunks_do_not_matter(view, monkeypatch):
     """Neither to what is seen nor to its derivative."""
     density = (0.1 + half_empty(9, 11, 10)).requires_grad_()
     bundle = cast_rays(make_camera(size=(7, 6), **view))
 
-    def marched() -> list[Tensor]:
+    def marched():
         seen = march_rays(emission_of(box_grid((9, 11, 10)), density), bundle, every_ray(2))
         return [*seen, *torch.autograd.grad((seen[0] - seen[1]).square().sum(), density)]
 
@@ -161,10 +157,10 @@ LIGHTS: dict[str, list[Light]] = {
 
 
 @pytest.fixture
-def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+def same_fields(monkeypatch):
     """Masses are interpolated linearly, and E8.7 is summed itself, in the fast march as well."""
 
-    def along(seen: SeenPhase, depth: Tensor | None, cosine: Tensor) -> Tensor:
+    def along(seen, depth, cosine):
         if seen.number is not None:
             cells = seen.phase.with_cells(seen.number.movedim(1, 0)[..., None])
             seen = SeenPhase(cells, seen.degree)
@@ -174,7 +170,7 @@ def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
             return seen.phase.value(cosine[..., None])[..., 0].movedim(0, 1)
         return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
 
-    def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
+    def at_angles(seen, depth, angle):
         actual = along(seen, depth, angle.cos())
         return actual.movedim(0, 1) if depth is None and seen.number is None else actual
 
@@ -183,7 +179,7 @@ def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SeenPhase, "at_angles", at_angles)
 
 
-def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scene:
+def lit_scene(lights, view, **changes):
     """A random medium; under a sky alone nothing scatters twice: it is lit by all directions."""
     model = "none" if isinstance(lights[0], EnvironmentLight) else "p1"
     cross_sections = {"sigma_a": (0.5, 1.0, 0.2), "sigma_s": (3.0, 2.0, 1.0)}
@@ -192,7 +188,7 @@ def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scen
     return replace(scene, lights=lights)
 
 
-def march_plainly(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+def march_plainly(outgoing, rays, steps):
     """Radiance [C, R] along `rays` and transmittance [C, R] (E2.1), by so many equal steps each."""
     grid = outgoing.grid
     near, far = intersect_box(grid, rays)
@@ -235,7 +231,7 @@ def march_plainly(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tens
     return scattered, tau[:, -1].expand_as(scattered)
 
 
-def interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
+def interpolate(grid, field, points):
     """Of a `field` with a layer more on each side, or of one number."""
     low, extent = points.new_tensor(grid.lower), points.new_tensor(grid.extent)
     longer = points.new_tensor(field.shape[1:]) / points.new_tensor(grid.shape)
@@ -244,9 +240,7 @@ def interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
     return grid_sample(field[None], places[None, None], **ways)[0, :, 0]
 
 
-def unattenuated(
-    beam: Beam | PointBeam, points: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor]:
+def unattenuated(beam, points, direction):
     if isinstance(beam, Beam):
         return beam.direction, beam.irradiance[..., 0]
     offset = points - beam.position
@@ -255,20 +249,20 @@ def unattenuated(
     return offset / square.sqrt()[..., None], beam.irradiance[..., 0] / square
 
 
-def emit(scene: Scene) -> tuple[OutgoingLight, Rays]:
+def emit(scene):
     rays = cast_rays(scene.views[0].camera)
     return send(solve_light(scene, SolveMemory()), rays), rays
 
 
-def march_fast(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+def march_fast(outgoing, rays, steps):
     return march_rays(outgoing, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
 
 
-def march_twin(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+def march_twin(outgoing, rays, steps):
     return march_plainly(outgoing, rays, 12 * steps)
 
 
-def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
+def differences(of):
     """How far apart the two marches' `of(marcher, steps)` are, relative to the norm, at STEPS."""
     apart = []
     for steps in STEPS:
@@ -296,7 +290,7 @@ CASES += [("a point inside", "oblique", phase) for phase in PHASES]
 
 @pytest.mark.parametrize(("lights", "view", "medium"), CASES)
 @pytest.mark.usefixtures("same_fields")
-def test_images_agree_in_the_limit(lights: str, view: str, medium: str):
+def test_images_agree_in_the_limit(lights, view, medium):
     scene = lit_scene(LIGHTS[lights], VIEWS[view], **MEDIA.get(medium, {}))
     scene.volume.phase = PHASES.get(medium, scene.volume.phase)
     outgoing, rays = emit(scene)
@@ -321,7 +315,7 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
     assert errors[-1] < 2e-3 and convergence_order([1 / 8, 1 / 16, 1 / 32], errors) > 1.5, errors
 
 
-def test_rounding_does_not_choose_between_axes() -> None:
+def test_rounding_does_not_choose_between_axes():
     """Seen at 45 degrees two axes are crossed equally fast: slices lie across the first of them."""
     grid = Grid((6, 6, 6), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     rays = cast_rays(make_camera(eye=(2.5, 0.0, 2.5), half_width=0.2))

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
@@ -21,13 +20,12 @@ from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.picture import render
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 SHAPE = (4, 5, 6)
 
 
-def medium(seed: int, sigma_s: Tensor, g: float) -> Volume:
+def medium(seed, sigma_s, g):
     phase = HenyeyGreenstein(tensor(g)[0])
     density = random_values(*SHAPE, seed=seed)
     return Volume(box_grid(SHAPE), density, 0.1 * sigma_s, sigma_s, phase)
@@ -36,7 +34,7 @@ def medium(seed: int, sigma_s: Tensor, g: float) -> Volume:
 SMOKE, DUST = medium(1, tensor(3.0), 0.6), medium(2, tensor(1.0, 2.0, 4.0), -0.3)
 
 
-def scene_of(volume: Volume) -> Scene:
+def scene_of(volume):
     return replace(make_scene(volume.density, transport_rounds=1, ambient=(0.2,)), volume=volume)
 
 
@@ -50,7 +48,7 @@ def test_sections_and_mean_cosine_are_those_of_both_weighed_by_how_much_each_sca
 
 
 @pytest.mark.parametrize("one, other", [(SMOKE, DUST), (DUST, SMOKE)])
-def test_beside_nothing_a_medium_is_as_it_is_alone(one: Volume, other: Volume):
+def test_beside_nothing_a_medium_is_as_it_is_alone(one, other):
     nothing = replace(other, density=torch.zeros(SHAPE, dtype=torch.float64))
     images = [
         render(scene_of(mix_media(media)))
@@ -87,7 +85,7 @@ def test_on_a_coarser_grid_each_medium_is_coarser():
 
 
 @pytest.mark.parametrize("glow", ["emission", "black_body"])
-def test_what_a_mixture_has_itself_it_has_on_coarser_grids_and_with_other_values(glow: str):
+def test_what_a_mixture_has_itself_it_has_on_coarser_grids_and_with_other_values(glow):
     """Of what glows and scatters there is as much; it glows, and scatters, where its support is."""
     support, glows = (random_values(*SHAPE, seed=3) > 0.5).double(), {glow: tensor(0.2, 0.3, 0.5)}
     whole = replace(mix_media({"smoke": SMOKE, "dust": DUST}), support=support, index=1.4, **glows)
@@ -125,7 +123,7 @@ GRID = Grid(FLAT, (-0.4, -0.3, -0.5), (0.4, 0.3, 0.5))
 
 
 @pytest.mark.parametrize(("times", "along"), [(3, "xyz"), (9, "xyz"), (3, "xy")])
-def test_a_finer_medium_has_the_same_values_everywhere(times: int, along: str):
+def test_a_finer_medium_has_the_same_values_everywhere(times, along):
     """And is as empty beyond its support."""
     scene = make_scene(random_values(*FLAT), sigma_s=random_values(3, *FLAT, seed=1), grid=GRID)
     support = random_values(*FLAT, seed=3) > 0.5

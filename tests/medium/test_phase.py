@@ -1,13 +1,11 @@
 """Phase functions and the scaling of their peak, checked by their moments over the sphere."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from media import box_grid, make_scene, random_values, summed_series, tensor
-from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
 from ddrecon.medium.phase import (
@@ -22,17 +20,16 @@ from ddrecon.medium.phase import (
 from ddrecon.numerics.autodiff import tensors_in
 from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
 
 
-def scalar(value: float) -> Tensor:
+def scalar(value):
     return torch.tensor(value, dtype=torch.float64)
 
 
-def bump() -> Tensor:
+def bump():
     """A smooth table with a wide peak, not normalized."""
     return 3 * torch.exp(2 * even_angles(STEPS).cos())[None]
 
@@ -51,14 +48,14 @@ each_phase = pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES.keys()
 each_degree = pytest.mark.parametrize("degree", [1, 3])
 
 
-def legendre_moments(values: Tensor, count: int) -> Tensor:
+def legendre_moments(values, count):
     """The averages [C, count] of P_l over the sphere, weighted by values [C, n] at NODES."""
     rows = np.polynomial.legendre.legvander(NODES, count - 1) * WEIGHTS[:, None] / 2
     return values @ torch.from_numpy(rows)
 
 
 @each_phase
-def test_moments_are_those_of_the_values(phase: PhaseFunction):
+def test_moments_are_those_of_the_values(phase):
     found = legendre_moments(phase.value(torch.tensor(NODES)), 12)
     torch.testing.assert_close(found, phase.moments(12), rtol=0, atol=1e-7)
     assert len(found) == phase.colors
@@ -77,7 +74,7 @@ TWO = TwoLobe(tensor(0.6, -0.3), scalar(0.4))
         (Tabulated(1 + even_angles(STEPS).cos()[None] ** 2), Rayleigh(scalar(0.0))),
     ],
 )
-def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
+def test_special_cases_are_each_other(one, other):
     cosine = torch.linspace(-1, 1, 37, dtype=torch.float64)
     torch.testing.assert_close(one.value(cosine), other.value(cosine), rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(one.moments(30), other.moments(30), rtol=0, atol=1e-10)
@@ -87,13 +84,13 @@ def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
 
 
 @pytest.mark.parametrize("name", [name for name in PHASES if name not in ("rayleigh", "table")])
-def test_all_that_is_asked_has_both_derivatives(name: str):
+def test_all_that_is_asked_has_both_derivatives(name):
     """Values, moments, and what beams with a peak and without one are seen by."""
     phase, cosine = PHASES[name], tensor(-0.9, -0.2, 0.4, 0.95).requires_grad_()
     numbers = [number.clone().requires_grad_() for number in tensors_in(phase)]
     depth = random_values(3, phase.colors, 4).requires_grad_()
 
-    def ask(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+    def ask(depth, cosine, *numbers):
         others = iter(numbers)
         other = phase.map(lambda _: next(others))
         tails, seen = (other.peak_tail(1, 4), other.peak_tail(3, 4, -1)), SeenPhase(other, 1)
@@ -107,7 +104,7 @@ def test_all_that_is_asked_has_both_derivatives(name: str):
 # --- what a forward peak does to a beam ----------------------------------------------------------
 
 
-def peak_moment(g: float, depth: float, degree: int, kept: int) -> float:
+def peak_moment(g, depth, degree, kept):
     """The moment of light that the forward peak alone has scattered, on a way of `depth`.
 
     n scatterings fall on it with Poisson's probability, each is the one in question with 1 / n,
@@ -124,9 +121,7 @@ def peak_moment(g: float, depth: float, degree: int, kept: int) -> float:
 @pytest.mark.parametrize("g", [0.05, 0.2, 0.4])
 @pytest.mark.parametrize("depth", [1e-9, 0.3, 2.0, 9.0])
 @each_degree
-def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(
-    g: float, depth: float, degree: int
-):
+def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(g, depth, degree):
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
     found = legendre_moments(summed_series(seen, tensor(depth)[None], torch.tensor(NODES)), 8)[0]
     for moment in range(8):
@@ -141,7 +136,7 @@ def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(
     ids=[*PHASES, "0.1", "0.95"],
 )
 @each_degree
-def test_along_rays_a_spread_peak_is_nearly_the_same(phase: PhaseFunction, degree: int):
+def test_along_rays_a_spread_peak_is_nearly_the_same(phase, degree):
     """And where nothing lies behind it, it is the exact phase function."""
     cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
     depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 100)]).double().view(-1, 1, 1)
@@ -154,7 +149,7 @@ def test_along_rays_a_spread_peak_is_nearly_the_same(phase: PhaseFunction, degre
 
 
 @each_phase
-def test_a_spread_peak_is_finite_and_not_negative_at_any_depth(phase: PhaseFunction):
+def test_a_spread_peak_is_finite_and_not_negative_at_any_depth(phase):
     depth = torch.logspace(-30, 10, 21).view(-1, 1, 1).requires_grad_()
     cosine = torch.linspace(-1, 1, 21).requires_grad_()
     found = SeenPhase(phase, 3).along(depth.expand(-1, phase.colors, 21), cosine)
@@ -168,7 +163,7 @@ def test_a_spread_peak_is_finite_and_not_negative_at_any_depth(phase: PhaseFunct
 
 @each_phase
 @each_degree
-def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, degree: int):
+def test_scaling_a_forward_peak_leaves_no_backward_rest(phase, degree):
     """What remains has a mean cosine, and a peak no more than all of scattering."""
     f = phase.peak_tail(degree, 1)[:, 0]
     assert bool(((f >= 0) & (f < 1)).all())
@@ -179,7 +174,7 @@ def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, de
 
 @pytest.mark.parametrize("varies", [False, True])
 @pytest.mark.parametrize("g", MEAN_COSINES)
-def test_scaling_leaves_the_transport_extinction_alone(g: float, varies: bool):
+def test_scaling_leaves_the_transport_extinction_alone(g, varies):
     """Cross sections may be the same in all cells, or given cell by cell."""
     grid, density = box_grid((2, 3, 4)), random_values(2, 3, 4)
     cells = grid.shape if varies else (1, 1, 1)
@@ -216,7 +211,7 @@ FIELDS: dict[str, PhaseFunction] = {
 each_field = pytest.mark.parametrize("phase", FIELDS.values(), ids=FIELDS.keys())
 
 
-def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
+def scene_of(phase, **changes):
     """Cross sections are given cell by cell, as coefficients are where a phase function is."""
     sigma_s = torch.tensor([8.0, 6.0, 4.0], dtype=torch.float64).view(3, 1, 1, 1)
     given = {"sigma_s": sigma_s.expand(3, *SHAPE), "ambient": (0.3,)} | changes
@@ -236,7 +231,7 @@ def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
     ],
     ids=["forward", "isotropic", "backward", "two lobes", "two forward lobes", "blend by color"],
 )
-def test_the_same_in_every_cell_is_one_number(phase: PhaseFunction, is_looked_up: bool, rounds):
+def test_the_same_in_every_cell_is_one_number(phase, is_looked_up, rounds):
     """To rounding, or as closely as functions are looked up by their number."""
     number = [*tensors_in(phase)][-1]
     cells = phase.with_cells(number.view(*number.shape, 1, 1, 1).expand(*number.shape, *SHAPE))
@@ -260,9 +255,7 @@ BETWEEN = [
 
 
 @pytest.mark.parametrize(("phase", "degree", "close"), BETWEEN)
-def test_between_the_numbers_of_its_table_s_is_that_of_the_number(
-    phase: PhaseFunction, degree: int, close: float
-):
+def test_between_the_numbers_of_its_table_s_is_that_of_the_number(phase, degree, close):
     """Of one at nodes, beside that of `phase` itself; and p, where there is no peak."""
     depth, cosine = 4 * random_values(7, 1, 9), 2 * random_values(9, seed=1) - 1
     number = [*tensors_in(phase)][-1]
@@ -275,7 +268,7 @@ def test_between_the_numbers_of_its_table_s_is_that_of_the_number(
 
 
 @each_field
-def test_cells_without_scattering_have_no_phase_function(phase: PhaseFunction):
+def test_cells_without_scattering_have_no_phase_function(phase):
     """Their number changes moments of nothing, and its derivative is zero and finite."""
     density = random_values(*SHAPE)
     density[:, :, 3:] = 0

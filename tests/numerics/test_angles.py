@@ -24,7 +24,7 @@ degrees = pytest.mark.parametrize("degree", [0, 1, 3, 5, 7])
 
 @degrees
 @pytest.mark.parametrize("count", DEGREES)
-def test_harmonics_are_orthonormal_where_a_rule_is_exact(degree: int, count: int):
+def test_harmonics_are_orthonormal_where_a_rule_is_exact(degree, count):
     if 2 * degree > DEGREES[count]:
         degree = DEGREES[count] // 2
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
@@ -35,7 +35,7 @@ def test_harmonics_are_orthonormal_where_a_rule_is_exact(degree: int, count: int
 
 @degrees
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sums_over_orders_are_legendre_polynomials_of_the_cosine(degree: int, dtype: torch.dtype):
+def test_sums_over_orders_are_legendre_polynomials_of_the_cosine(degree, dtype):
     generator = torch.Generator().manual_seed(1)
     a, b = (
         torch.nn.functional.normalize(torch.randn(20, 3, generator=generator, dtype=dtype), dim=-1)
@@ -106,11 +106,11 @@ RULES = {count: sphere_quadrature(torch.zeros(1, dtype=torch.float64), count) fo
 each_rule = pytest.mark.parametrize("count", RULES)
 
 
-def double_factorial(n: int) -> int:
+def double_factorial(n):
     return math.prod(range(n, 0, -2))
 
 
-def sphere_mean(powers: tuple[int, int, int]) -> float:
+def sphere_mean(powers):
     """x^a y^b z^c over the sphere: (a-1)!! (b-1)!! (c-1)!! / (a+b+c+1)!!, or 0 for an odd power."""
     if any(power % 2 for power in powers):
         return 0.0
@@ -118,14 +118,14 @@ def sphere_mean(powers: tuple[int, int, int]) -> float:
     return above / double_factorial(sum(powers) + 1)
 
 
-def error(count: int, powers: tuple[int, int, int]) -> float:
+def error(count, powers):
     directions, weights = RULES[count]
     mean = weights @ (directions ** torch.tensor(powers)).prod(1)
     return abs(float(mean) - sphere_mean(powers))
 
 
 @each_rule
-def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count: int):
+def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count):
     top = DEGREES[count] + 1
     monomials = [each for each in product(range(top + 1), repeat=3) if sum(each) <= top]
     assert max(error(count, powers) for powers in monomials if sum(powers) < top) < 1e-15

@@ -10,7 +10,6 @@ import pytest
 import torch
 from far_device import FAR
 from media import random_values
-from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.numerics import remember as module
@@ -19,24 +18,24 @@ from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.remember import forget_changed, is_any_nonzero, remember
 
 
-def curved(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def curved(x, y):
     return (x * y).exp() + x.sin(), x * x / (1 + y * y)
 
 
-def nested(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def nested(x, y):
     one, other = recompute(curved, x * y, y)
     return recompute(curved, one.sqrt(), other + x)
 
 
 @pytest.mark.parametrize("function", [curved, nested])
-def test_derivatives_are_those_of_what_is_kept(function) -> None:
+def test_derivatives_are_those_of_what_is_kept(function):
     x, y = (random_values(3, 4, 5, seed=seed).requires_grad_() for seed in (0, 1))
     assert torch.autograd.gradcheck(
         lambda x, y: recompute(function, x, y), (x, y), check_forward_ad=True
     )
 
 
-def test_the_backward_pass_may_be_made_twice() -> None:
+def test_the_backward_pass_may_be_made_twice():
     x, y = (random_values(3, 4, 5, seed=seed).requires_grad_() for seed in (0, 1))
     total = sum(part.sum() for part in recompute(nested, x, y))
     first, second = (torch.autograd.grad(total, (x, y), retain_graph=True) for _ in range(2))
@@ -45,7 +44,7 @@ def test_the_backward_pass_may_be_made_twice() -> None:
 
 
 @pytest.mark.parametrize("is_forward", [True, False])
-def test_forward_mode_may_begin_or_end_before_the_backward_pass(is_forward: bool) -> None:
+def test_forward_mode_may_begin_or_end_before_the_backward_pass(is_forward):
     """There interpolation goes another way."""
     values, points = random_values(2, 3, 4, 5), 2 * random_values(3, 6, 3, seed=1) - 1
     way, leaf = random_values(2, 3, 4, 5, seed=2), values.clone().requires_grad_()
@@ -61,10 +60,10 @@ def test_forward_mode_may_begin_or_end_before_the_backward_pass(is_forward: bool
         torch.testing.assert_close(change.detach(), (known * way).sum())
 
 
-def test_nothing_between_arguments_and_result_stays() -> None:
+def test_nothing_between_arguments_and_result_stays():
     seen: list[weakref.ref[torch.UntypedStorage]] = []
 
-    def function(x: Tensor) -> Tensor:
+    def function(x):
         between = x.exp()
         seen.append(weakref.ref(between.untyped_storage()))
         return between * between
@@ -81,7 +80,7 @@ def doubled():
     calls = []
 
     @remember
-    def double(values: Tensor, times: int = 2) -> Tensor:
+    def double(values, times=2):
         calls.append(times)
         return times * values
 

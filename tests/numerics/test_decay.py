@@ -4,20 +4,19 @@ import numpy as np
 import pytest
 import torch
 from media import random_values
-from torch import Tensor
 
 from ddrecon.numerics.decay import SERIES_BELOW, decay_mean, decay_terms, decayed_sum
 
 DEPTHS = (0.0, 1e-6, SERIES_BELOW - 1e-3, SERIES_BELOW + 1e-3, 0.3, 5.0, 50.0, 1e4)
 
 
-def mean_by_quadrature(begin: float, end: float) -> float:
+def mean_by_quadrature(begin, end):
     """The mean of exp(-depth) for depth going linearly from `begin` to `end`."""
     nodes, weights = np.polynomial.legendre.leggauss(60)
     return float((np.exp(-(begin + (end - begin) * (nodes + 1) / 2)) * weights).sum() / 2)
 
 
-def segments() -> list[Tensor]:
+def segments():
     """weight, begin, end, scale of some segments, empty ones and both directions among them."""
     weight, begin, end = (random_values(6, 1, 4, seed=seed) for seed in range(3))
     end[0] = begin[0]
@@ -54,7 +53,7 @@ def test_both_modes_have_derivatives():
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_single_precision_follows_double(depth: float):
+def test_single_precision_follows_double(depth):
     """The derivative is a difference: rounding grows by 1 / depth if thin, by depth if thick."""
     slopes, means = [], []
     for dtype in (torch.float32, torch.float64):
@@ -67,7 +66,7 @@ def test_single_precision_follows_double(depth: float):
 
 
 @pytest.mark.parametrize("depth", [depth for depth in DEPTHS if depth <= 50])
-def test_what_leaves_a_step_and_is_on_it_against_quadrature(depth: float):
+def test_what_leaves_a_step_and_is_on_it_against_quadrature(depth):
     """Of what is emitted evenly, and in proportion to the way from the middle."""
     nodes, weights = np.polynomial.legendre.leggauss(60)
     part, weights = (nodes + 1) / 2, weights / 2

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 import pytest
 import torch
 from media import random_values
-from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.numerics.flow import carry, find_flow
@@ -20,7 +19,7 @@ from ddrecon.numerics.interpolation import (
 )
 
 
-def interpolated(values: Tensor, point: Tensor) -> Tensor:
+def interpolated(values, point):
     """Multilinear interpolation of `values` [K, ...] at one point, corner by corner."""
     sizes = values.shape[1:]
     backward = point.flip(0).tolist()
@@ -35,7 +34,7 @@ def interpolated(values: Tensor, point: Tensor) -> Tensor:
     return total
 
 
-def sample(values: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
+def sample(values, points, smooth=None):
     """Values [N, K, P] of slices, or of volumes one by one."""
     if values.ndim == 4:
         return sample_slices(values, points, smooth)
@@ -49,7 +48,7 @@ each_size = pytest.mark.parametrize("sizes", SIZES, ids=str)
 
 @each_size
 @pytest.mark.parametrize("is_forward", [False, True])
-def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward: bool):
+def test_values_are_those_of_explicit_corners(sizes, is_forward):
     """Also where forward mode is on, and cells are gathered."""
     values = random_values(2, 3, *sizes)
     points = 2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3
@@ -63,9 +62,7 @@ def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward
 @each_size
 @pytest.mark.parametrize("smooth", [None, ThirdOrder(1, 3, 0.5)], ids=["linear", "third order"])
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)], ids=str)
-def test_both_modes_have_derivatives(
-    sizes: tuple[int, ...], smooth: ThirdOrder | None, wanted: tuple[bool, bool]
-):
+def test_both_modes_have_derivatives(sizes, smooth, wanted):
     values = random_values(2, 3, *sizes)
     points = 2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2
     inputs = [values.requires_grad_(wanted[0]), points.requires_grad_(wanted[1])]
@@ -78,7 +75,7 @@ def test_both_modes_have_derivatives(
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("ulps", [-3, 0, 3])
-def test_the_slope_on_a_center_is_that_beyond_it(dtype: torch.dtype, ulps: int):
+def test_the_slope_on_a_center_is_that_beyond_it(dtype, ulps):
     """In both modes, whichever way coordinates are rounded."""
     slices = random_values(1, 1, 5, 7, dtype=dtype)
     columns, row = torch.arange(7, dtype=dtype), torch.tensor(1.3, dtype=dtype)
@@ -89,7 +86,7 @@ def test_the_slope_on_a_center_is_that_beyond_it(dtype: torch.dtype, ulps: int):
     across = 5 / 2 * (slices[0, 0, 2] - slices[0, 0, 1])
     slope, close = torch.stack([along, across], -1)[None], {"rtol": 1e-4, "atol": 1e-4}
 
-    def total(moved: Tensor) -> Tensor:
+    def total(moved):
         return sample_slices(slices, moved).sum()
 
     torch.testing.assert_close(torch.func.grad(total)(points), slope, **close)
@@ -101,7 +98,7 @@ def test_the_slope_on_a_center_is_that_beyond_it(dtype: torch.dtype, ulps: int):
 # --- third order ---------------------------------------------------------------------------------
 
 
-def centers(cells: int) -> Tensor:
+def centers(cells):
     return (2 * torch.arange(cells, dtype=torch.float64) + 1) / cells - 1
 
 
@@ -132,14 +129,14 @@ def test_subdivided_squares_are_exact_in_smooth_channels():
 SHAPE = (20, 28, 24)
 
 
-def blob(z: float, y: float, x: float) -> Tensor:
+def blob(z, y, x):
     lines = (torch.arange(n).double() - n / 2 - s for n, s in zip(SHAPE, (z, y, x), strict=True))
     zs, ys, xs = torch.meshgrid(*lines, indexing="ij")
     return 3 * torch.exp(-(zs**2 + ys**2 + xs**2) / 18)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.2), (1.0, 2.5, -1.5)])
-def test_the_flow_of_a_moved_blob_is_its_motion(shift: tuple[float, float, float]) -> None:
+def test_the_flow_of_a_moved_blob_is_its_motion(shift):
     before, after = blob(0, 0, 0), blob(*shift)
     flow = find_flow(before, after)
     weight = after / after.sum()
@@ -149,7 +146,7 @@ def test_the_flow_of_a_moved_blob_is_its_motion(shift: tuple[float, float, float
     assert error < 0.05
 
 
-def test_a_motion_of_whole_cells_shifts() -> None:
+def test_a_motion_of_whole_cells_shifts():
     field, flow = torch.rand(2, *SHAPE).double(), torch.zeros(3, *SHAPE).double()
     flow[1], flow[2] = 2, -1
     expected = field.roll((2, -1), (2, 3))
@@ -161,9 +158,7 @@ def test_a_motion_of_whole_cells_shifts() -> None:
 
 @pytest.mark.parametrize("shape", [(3, 4, 6), (2, 1, 5), (1, 1, 1)])
 @pytest.mark.parametrize("count", [2, 3])
-def test_a_mean_around_an_entry_is_that_of_the_entries_that_there_are(
-    shape: tuple[int, ...], count: int
-) -> None:
+def test_a_mean_around_an_entry_is_that_of_the_entries_that_there_are(shape, count):
     """Also where an axis is shorter than what is averaged."""
     field = random_values(2, *shape)
     means = mean_around(field, 3, count)

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper").glob("*.yaml"))}
 
 
-def test_every_experiment_has_a_config_and_a_picture() -> None:
+def test_every_experiment_has_a_config_and_a_picture():
     pictures = re.findall(
         r"\]\((pictures/paper/.*?)\)", (ROOT / "docs" / "experiments.md").read_text()
     )

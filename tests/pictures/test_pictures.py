@@ -20,14 +20,14 @@ from ddrecon.pictures import (
 )
 
 
-def smooth_picture(size: int = 160) -> torch.Tensor:
+def smooth_picture(size=160):
     """A picture with everything between black and 1, whose second differences are nearly 0."""
     place = torch.linspace(0, 1, size, dtype=torch.float64)
     return torch.stack([(place[:, None] * place.roll(0)) ** power for power in (1.0, 1.5, 2.0)])
 
 
 @pytest.mark.parametrize(("read", "shot"), [(0.02, 0.0), (0.005, 2e-3), (0.0, 1e-3)])
-def test_the_noise_of_a_picture_is_found(read: float, shot: float) -> None:
+def test_the_noise_of_a_picture_is_found(read, shot):
     picture, generator = smooth_picture(), torch.Generator().manual_seed(1)
     random = torch.randn(picture.shape, generator=generator, dtype=torch.float64)
     found = estimate_noise(picture + Noise(read, shot).deviation(picture) * random, 0.0)
@@ -37,14 +37,14 @@ def test_the_noise_of_a_picture_is_found(read: float, shot: float) -> None:
         assert float(found.deviation(at)) == pytest.approx(wanted, rel=0.15)
 
 
-def test_a_smooth_picture_errs_by_the_least_that_is_assumed() -> None:
+def test_a_smooth_picture_errs_by_the_least_that_is_assumed():
     picture = smooth_picture()
     found = estimate_noise(picture, 0.0)
     least = LEAST * float(picture.square().mean().sqrt())
     assert found.read == pytest.approx(least, rel=0.5) and found.shot < 1e-6
 
 
-def test_quantization_is_that_of_rounded_values() -> None:
+def test_quantization_is_that_of_rounded_values():
     values = torch.linspace(0.01, 0.9, 200_001, dtype=torch.float64)
     step = 1 / 255
     shown = display(values)
@@ -56,17 +56,17 @@ def test_quantization_is_that_of_rounded_values() -> None:
         )
 
 
-def test_a_picture_too_small_to_tell_has_read_noise_only() -> None:
+def test_a_picture_too_small_to_tell_has_read_noise_only():
     assert estimate_noise(torch.rand(3, 2, 9), 0.0).shot == 0
 
 
-def test_the_slope_of_display_is_its_derivative() -> None:
+def test_the_slope_of_display_is_its_derivative():
     values = torch.linspace(1e-4, 0.999, 400, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(display(values).sum(), values)
     torch.testing.assert_close(display_slope(values.detach()), slope)
 
 
-def test_without_quantization_radiance_is_stabilized_by_a_square_root() -> None:
+def test_without_quantization_radiance_is_stabilized_by_a_square_root():
     read, shot = 0.01, 0.002
     values = torch.linspace(0, 1.3, 500, dtype=torch.float64)
     wanted = (2 / shot) * ((read**2 + shot * values).sqrt() - read)
@@ -75,7 +75,7 @@ def test_without_quantization_radiance_is_stabilized_by_a_square_root() -> None:
 
 
 @pytest.mark.parametrize("step", [0.0, 1 / 255])
-def test_a_flat_picture_has_the_slope_of_its_scale(step: float) -> None:
+def test_a_flat_picture_has_the_slope_of_its_scale(step):
     scale, level, change = Stabilized(noise=Noise(0.001, 1e-3, step)), 0.3, 1e-3
     flat = torch.full((3, 7, 8), level, dtype=torch.float64)
     places = torch.tensor([level - change, level + change, 1.0], dtype=torch.float64)
@@ -87,7 +87,7 @@ def test_a_flat_picture_has_the_slope_of_its_scale(step: float) -> None:
 PEAK = torch.tensor(1.0, dtype=torch.float64)
 
 
-def test_flat_images_differ_in_their_means_only() -> None:
+def test_flat_images_differ_in_their_means_only():
     one, other = (torch.full((1, 12, 12), value, dtype=torch.float64) for value in (0.3, 0.6))
     wanted = (2 * 0.18 + K1**2) / (0.09 + 0.36 + K1**2)
     torch.testing.assert_close(
@@ -95,7 +95,7 @@ def test_flat_images_differ_in_their_means_only() -> None:
     )
 
 
-def test_a_pixel_is_what_its_definition_says() -> None:
+def test_a_pixel_is_what_its_definition_says():
     image, other = torch.rand(2, 1, 16, 13, dtype=torch.float64).unbind()
     row, column = 2, 11  # near two edges
     weights, pairs = [], []
@@ -105,7 +105,7 @@ def test_a_pixel_is_what_its_definition_says() -> None:
             weights.append(math.exp(-square / (2 * DEVIATION**2)))
             pairs.append((float(image[0, i, j]), float(other[0, i, j])))
 
-    def mean(values: list[float]) -> float:
+    def mean(values):
         return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(weights)
 
     a, b = mean([x for x, _ in pairs]), mean([y for _, y in pairs])

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,15 +16,13 @@ from ddrecon.run.job import load_checkpoint
 from ddrecon.scene_file.load import scene_text
 
 pytestmark = pytest.mark.slow
-Job = dict[str, Any]
-"""As `forked.py` takes them."""
 VIEWS = {"a": (0, 0, 2.5), "b": (2.5, 0, 0), "c": (0, 0.5, -2), "d": (2, 1, 1), "e": (-2, -1, 1)}
 """Two of which are test views."""
 SOUGHT = """{density: {init: 0.4, tv: 0.001}, sigma_s: {field: true}, g: {},
  lights.0.irradiance: {}, views.c.camera: {}, views.*.exposure: {}, views.*.offset: {}}"""
 
 
-def write_scene(folder: Path) -> None:
+def write_scene(folder):
     """The small scene in five views of two sizes, of which all kinds of numbers are sought."""
     tree = yaml.safe_load(SCENE)
     tree["volume"] |= {"resolution": [8, 6, 5], "density": 0.5}
@@ -43,7 +40,7 @@ def write_scene(folder: Path) -> None:
     (folder / "scene.yaml").write_text(scene_text(tree))
 
 
-def job(ranks: int, output: str, *options: str, **others: Any) -> Job:
+def job(ranks, output, *options, **others):
     command = ["optimize", "scene.yaml", "-o", output, "--dtype", "float64", "--engine", "torch"]
     return {"ranks": ranks, "arguments": [*command, "--iterations", "3", *options]} | others
 
@@ -54,7 +51,7 @@ RENDER += [*(word for name in SHOWN for word in ("--view", name)), "-o"]
 FIELDS = "density", "sigma_s"
 
 
-def sure(ranks: int, output: str, *options: str) -> Job:
+def sure(ranks, output, *options):
     command = ["uncertainty", "plain", "-o", output, "--engine", "torch"]
     return {"ranks": ranks, "arguments": [*command, "-D", "optimize.noise={read: 0.05}", *options]}
 
@@ -80,15 +77,15 @@ JOBS = {
 class Runs:
     """The `folder` in which `JOBS` were run, and what became of them."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder):
         self.folder, self.names = folder, list(JOBS)
         codes = json.loads((folder / "codes.json").read_text())
         self.codes = dict(zip(JOBS, codes, strict=True))
 
-    def text(self, name: str, rank: int, end: str) -> str:
+    def text(self, name, rank, end):
         return (self.folder / f"{self.names.index(name)}.{rank}.{end}").read_text()
 
-    def log(self, output: str) -> np.ndarray:
+    def log(self, output):
         """The log in the folder `output`, without times and steps of solves, which may be cut."""
         with (self.folder / output / "loss.csv").open() as stream:
             rows = [
@@ -96,7 +93,7 @@ class Runs:
             ]
         return np.array([[float(cell or 0) for cell in row.values()] for row in rows])
 
-    def found(self, output: str) -> dict[str, np.ndarray]:
+    def found(self, output):
         """All that a run found."""
         path = self.folder / output
         numbers = json.loads((path / "parameters.json").read_text())
@@ -107,7 +104,7 @@ class Runs:
         }
         return fields | views
 
-    def compare(self, output: str, alone: str) -> None:
+    def compare(self, output, alone):
         """Asserts that a run found what another did, to rounding, all the way."""
         np.testing.assert_allclose(self.log(output), self.log(alone), rtol=1e-7)
         expected, found = self.found(alone), self.found(output)
@@ -118,7 +115,7 @@ class Runs:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+def runs(tmp_path_factory):
     """What becomes of `JOBS`, one after the other in a folder with the scene in it."""
     folder = tmp_path_factory.mktemp("ranks")
     write_scene(folder)
@@ -136,18 +133,18 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
 
 
 @pytest.mark.parametrize("output", ["four", "broken"])
-def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
+def test_ranks_find_what_one_finds(runs, output):
     runs.compare(output, "one")
 
 
-def test_the_first_rank_alone_prints(runs: Runs) -> None:
+def test_the_first_rank_alone_prints(runs):
     for name in ("four", "rendered", "checked"):
         assert set(runs.codes[name]) == {0}
         assert runs.text(name, 0, "out")
         assert (runs.text(name, 1, "out"), runs.text(name, 1, "err")) == ("", "")
 
 
-def test_a_killed_rank_loses_nothing(runs: Runs) -> None:
+def test_a_killed_rank_loses_nothing(runs):
     assert runs.codes["killed"] == [5, -9]
     line = runs.text("killed", 0, "err").splitlines()[-1]
     assert line.startswith("another rank has ended (")
@@ -155,13 +152,13 @@ def test_a_killed_rank_loses_nothing(runs: Runs) -> None:
     assert runs.codes["resumed"] == [0, 0, 0]
 
 
-def test_a_checkpoint_stands_where_the_first_rank_is_killed(runs: Runs) -> None:
+def test_a_checkpoint_stands_where_the_first_rank_is_killed(runs):
     assert runs.codes["first killed"] == [-9, 5]
     state = load_checkpoint(runs.folder / "headless" / "checkpoints")[0]
     assert state["frames"][0]["total"]["iteration"] == 0
 
 
-def test_a_rank_that_fails_says_why(runs: Runs) -> None:
+def test_a_rank_that_fails_says_why(runs):
     assert runs.codes["failed"] == [5, 3]
     assert runs.text("failed", 1, "err").splitlines() == ["rank 1: some.file: is odd"]
     assert "another rank has ended (" in runs.text("failed", 0, "err")
@@ -170,7 +167,7 @@ def test_a_rank_that_fails_says_why(runs: Runs) -> None:
     assert runs.text("refused", 1, "err") == ""
 
 
-def test_ranks_render_what_one_renders(runs: Runs) -> None:
+def test_ranks_render_what_one_renders(runs):
     files = sorted(path.name for path in (runs.folder / "alone").iterdir())
     assert files == sorted(path.name for path in (runs.folder / "views").iterdir())
     arrays = [name for name in files if name.endswith(".npy")]
@@ -180,11 +177,11 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_one_rank_imports_and_starts_nothing(runs: Runs) -> None:
+def test_one_rank_imports_and_starts_nothing(runs):
     assert runs.text("one", 0, "out").splitlines()[-2:] == ["[]", "False"]
 
 
-def test_ranks_make_the_experiments_of_one(runs: Runs) -> None:
+def test_ranks_make_the_experiments_of_one(runs):
     """They go on where one has begun; the first of them alone writes."""
     assert runs.codes["sure begun"] == [0]
     assert runs.codes["sure of three"] == [0, 0, 0]

@@ -11,11 +11,10 @@ from ddrecon.grid import Grid
 from ddrecon.reconstruct.metric import calibration_prior, find_gauges
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.tuning import SHIFT, TURN
-from ddrecon.scene import Scene
 from ddrecon.settings import ParameterSettings
 
 
-def parameters(scene: Scene, key: str, values: list[torch.Tensor]) -> list[Parameter]:
+def parameters(scene, key, values):
     names = [f"views.{view.name}.{key}" for view in scene.views]
     return [
         Parameter(name, ParameterSettings(), value, scene.volume.grid)
@@ -24,7 +23,7 @@ def parameters(scene: Scene, key: str, values: list[torch.Tensor]) -> list[Param
 
 
 @pytest.fixture
-def world(ball_scene: Scene) -> Scene:
+def world(ball_scene):
     views = [
         replace(view, camera=replace(view.camera, pose=view.camera.pose.double()))
         for view in ball_scene.views
@@ -33,7 +32,7 @@ def world(ball_scene: Scene) -> Scene:
     return replace(ball_scene, views=views[:4])
 
 
-def test_the_mean_exposure_is_held_by_color(world: Scene) -> None:
+def test_the_mean_exposure_is_held_by_color(world):
     start = torch.ones(len(world.views), 3).double()
     exposures = parameters(world, "exposure", list(start))
     (gauge,) = find_gauges(world, exposures)
@@ -45,13 +44,13 @@ def test_the_mean_exposure_is_held_by_color(world: Scene) -> None:
     torch.testing.assert_close((held / moved).log().std(0), torch.zeros(3).double())
 
 
-def test_one_view_alone_and_some_of_several_have_no_gauge(world: Scene) -> None:
+def test_one_view_alone_and_some_of_several_have_no_gauge(world):
     exposures = parameters(world, "exposure", [torch.ones(1)] * len(world.views))
     assert find_gauges(world, exposures[1:]) == []
     assert find_gauges(replace(world, views=world.views[:1]), exposures[:1]) == []
 
 
-def test_a_motion_of_all_cameras_together_is_taken_out(world: Scene) -> None:
+def test_a_motion_of_all_cameras_together_is_taken_out(world):
     """The cameras are turned and moved as one rigid body, and nothing of it is left."""
     center, turn, shift = world.volume.grid.center_xyz, [0.02, -0.01, 0.03], [0.1, 0.2, -0.1]
     common = []
@@ -80,7 +79,7 @@ def test_a_motion_of_all_cameras_together_is_taken_out(world: Scene) -> None:
 GRID = Grid((4, 6, 5), (-1.0, -1.0, -1.0), (1.0, 2.0, 1.0))
 
 
-def test_a_camera_turned_in_its_place_errs_in_direction_only() -> None:
+def test_a_camera_turned_in_its_place_errs_in_direction_only():
     place = torch.tensor([2.0, 1.0, 3.0], dtype=torch.float64)
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     camera = Camera(look_at(place, torch.zeros(3).double(), up), (8, 8), 0.3)
@@ -95,7 +94,7 @@ def test_a_camera_turned_in_its_place_errs_in_direction_only() -> None:
     assert float(shift @ prior @ shift) == pytest.approx(wanted)
 
 
-def test_parallel_rays_come_from_no_place() -> None:
+def test_parallel_rays_come_from_no_place():
     pose = look_at(*torch.tensor([[0.0, 0, 5], [0, 0, 0], [0, 1, 0]], dtype=torch.float64))
     priors = []
     for distance in (5.0, 50.0):

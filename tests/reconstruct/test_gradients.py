@@ -6,14 +6,12 @@ import pytest
 import torch
 from media import make_scene, random_values
 from scenes import three_views
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.picture import render_each
-from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
+from ddrecon.reconstruct.gradients import differentiate, solve_tolerances
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.tuning import GRADIENT_ERROR
-from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings, ParameterSettings
 from ddrecon.variables.values import value_of, with_values
 
@@ -23,19 +21,19 @@ NAMES += "lights.1.radiance", "views.one.camera"
 
 
 @pytest.fixture
-def scene() -> Scene:
+def scene():
     return three_views(make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4)))
 
 
-def loss_of(view: View, image: Tensor) -> Tensor:
+def loss_of(view, image):
     return (image - view.image).square().mean()
 
 
-def leaves_of(scene: Scene) -> dict[str, Tensor]:
+def leaves_of(scene):
     return {name: value_of(scene, name).clone().requires_grad_() for name in NAMES}
 
 
-def test_it_is_the_derivative_of_the_sum_over_views(scene: Scene) -> None:
+def test_it_is_the_derivative_of_the_sum_over_views(scene):
     values = leaves_of(scene)
     found = differentiate(scene, ["one", "three"], values, loss_of, SolveMemory())
     world = with_values(scene, values)
@@ -50,34 +48,34 @@ def test_it_is_the_derivative_of_the_sum_over_views(scene: Scene) -> None:
     assert all(map(torch.equal, found.images, images))
 
 
-def test_one_adjoint_serves_all_views_and_parameters(scene: Scene) -> None:
+def test_one_adjoint_serves_all_views_and_parameters(scene):
     memory = SolveMemory()
     differentiate(scene, ["one", "two", "three"], leaves_of(scene), loss_of, memory)
     assert [record.kind for record in memory.records] == ["forward", "adjoint"]
 
 
-def test_a_camera_nobody_looks_through_has_no_derivative(scene: Scene) -> None:
+def test_a_camera_nobody_looks_through_has_no_derivative(scene):
     name = "views.one.camera"
     values = {name: value_of(scene, name).requires_grad_()}
     found = differentiate(scene, ["two"], values, loss_of, SolveMemory())
     assert torch.equal(found.gradients[name], torch.zeros(6).double())
 
 
-def with_derivatives(scene: Scene, kind: str) -> Scene:
+def with_derivatives(scene, kind):
     parameters = {name: ParameterSettings() for name in NAMES}
     return replace(scene, optimize=OptimizeSettings(parameters, derivatives=kind))
 
 
-def test_only_the_diffusion_needs_an_adjoint(scene: Scene) -> None:
+def test_only_the_diffusion_needs_an_adjoint(scene):
     memory = SolveMemory()
     differentiate(with_derivatives(scene, "single"), ["one"], leaves_of(scene), loss_of, memory)
     assert [record.kind for record in memory.records] == ["forward"]
 
 
-def differentiated(scene: Scene, targets: dict[str, Tensor], memory: SolveMemory) -> Differentiated:
+def differentiated(scene, targets, memory):
     density = torch.full_like(scene.volume.density, 0.3).requires_grad_()
 
-    def loss_of(view, image: Tensor) -> Tensor:
+    def loss_of(view, image):
         return (image - targets.get(view.name, 0)).square().sum()
 
     return differentiate(
@@ -87,7 +85,7 @@ def differentiated(scene: Scene, targets: dict[str, Tensor], memory: SolveMemory
 
 @pytest.mark.slow
 @pytest.mark.parametrize("misfit", [1.0, 0.01])
-def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
+def test_the_gradient_is_as_exact_as_promised(misfit, ball_scene):
     """Towards pictures that differ from the images by `misfit` of their size."""
     scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, tolerance=1e-6))
     images = differentiated(scene, {}, SolveMemory()).images
@@ -104,7 +102,7 @@ def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
 
 
 @pytest.mark.slow
-def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(ball_scene: Scene):
+def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(ball_scene):
     changes = {"transport_rounds": 1, "tolerance": 1e-6, "warm_start": False}
     scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, **changes))
     run = Reconstruction(scene, 3)

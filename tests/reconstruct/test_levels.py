@@ -14,13 +14,13 @@ from ddrecon.reconstruct.setup import factors, scene_at_level
 from ddrecon.settings import NoiseSettings
 
 
-def test_coarsening_keeps_the_mass(ball_scene) -> None:
+def test_coarsening_keeps_the_mass(ball_scene):
     density = torch.rand(ball_scene.volume.grid.shape, dtype=torch.float64)
     coarse = resample(density, ball_scene.volume.grid.coarsen(2))
     assert torch.isclose(coarse.mean(), density.mean(), rtol=1e-12)
 
 
-def test_refining_keeps_constants_and_linear_fields_inside() -> None:
+def test_refining_keeps_constants_and_linear_fields_inside():
     fine = Grid((8, 8, 8), (0.0,) * 3, (1.0,) * 3)
     coarse = fine.coarsen(2)
     z = coarse.centers(torch.zeros(1, dtype=torch.float64))[0].expand(*coarse.shape)
@@ -29,7 +29,7 @@ def test_refining_keeps_constants_and_linear_fields_inside() -> None:
     assert torch.allclose(refined[1:-1], expected[1:-1], atol=1e-12)
 
 
-def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
+def test_targets_are_averaged_over_the_larger_pixels(ball_scene):
     coarse = scene_at_level(ball_scene, 2)
     for fine_view, view in zip(ball_scene.views, coarse.views, strict=True):
         assert torch.allclose(view.image.mean(), fine_view.image.mean(), rtol=1e-5)
@@ -37,7 +37,7 @@ def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
 
 
 @pytest.mark.parametrize("times", [1, 6, 24])
-def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times: int) -> None:
+def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times):
     """A photograph of ten million pixels shows a grid of 32^3 cells no better than a small one."""
     view, grid = ball_scene.views[0], ball_scene.volume.grid
     image = view.image.repeat_interleave(times, 1).repeat_interleave(times, 2)
@@ -49,7 +49,7 @@ def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times
     assert torch.allclose(averaged.image.mean(), view.image.mean(), rtol=1e-3)
 
 
-def test_pixels_that_do_not_count_are_in_no_average(ball_scene) -> None:
+def test_pixels_that_do_not_count_are_in_no_average(ball_scene):
     """They may hold any number; those beside them keep theirs."""
     view = ball_scene.views[0]
     mask = (torch.rand(view.camera.size, generator=torch.manual_seed(0)) > 0.3).float()
@@ -60,7 +60,7 @@ def test_pixels_that_do_not_count_are_in_no_average(ball_scene) -> None:
     assert torch.allclose(averaged.image[:, averaged.mask > 0], torch.tensor(0.25))
 
 
-def test_noise_of_averaged_pictures_is_less(ball_scene) -> None:
+def test_noise_of_averaged_pictures_is_less(ball_scene):
     """The loss that given noise explains is that of pictures with such noise, at each level."""
     view = ball_scene.views[0]
     settings = replace(ball_scene.optimize, noise=NoiseSettings(read=0.03))
@@ -75,7 +75,7 @@ def test_noise_of_averaged_pictures_is_less(ball_scene) -> None:
         assert frame.noise_loss() == pytest.approx(loss, rel=0.1)
 
 
-def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
+def test_a_coarser_camera_sees_the_same_frame(ball_scene):
     camera: Camera = ball_scene.views[0].camera
     corners = (
         cast_rays(camera, (0.0, 0.0)).direction[0],
@@ -84,7 +84,7 @@ def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
     assert torch.allclose(*corners, atol=1e-6)
 
 
-def test_what_a_coarser_scene_starts_from_is_coarser_too(ball_scene) -> None:
+def test_what_a_coarser_scene_starts_from_is_coarser_too(ball_scene):
     fine = ball_scene.volume.density
     starts = {"density": fine, "sigma_a": torch.tensor([1.0, 2.0, 3.0])}
     coarse = scene_at_level(replace(ball_scene, starts=starts), 2)
@@ -93,7 +93,7 @@ def test_what_a_coarser_scene_starts_from_is_coarser_too(ball_scene) -> None:
 
 
 @pytest.mark.parametrize(("side", "wanted"), [(31, [1]), (32, [2, 1]), (64, [4, 2, 1])])
-def test_small_grids_are_not_coarsened_away(ball_scene, side: int, wanted: list[int]) -> None:
+def test_small_grids_are_not_coarsened_away(ball_scene, side, wanted):
     """The shortest side keeps `FEWEST_CELLS`."""
     assert tuning.FEWEST_CELLS == 16
     grid = replace(ball_scene.volume.grid, shape=(96, side, 80))

@@ -6,29 +6,27 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from ddrecon import load_scene
 from ddrecon.errors import DivergenceError, FormatError, SceneError, SolveError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct import loop, tuning
-from ddrecon.reconstruct.frame import Evaluation, Frame
+from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.run.job import FORMAT, load_checkpoint
-from ddrecon.scene import Scene, View
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
 
-def error_of(density: torch.Tensor) -> float:
+def error_of(density):
     truth = torch.as_tensor(read_field(TRUTH, "density").values)
     return float((density - truth).abs().sum() / truth.sum())
 
 
-def test_an_empty_volume_comes_closer_to_the_truth(ball_scene: Scene) -> None:
+def test_an_empty_volume_comes_closer_to_the_truth(ball_scene):
     result = optimize(ball_scene, iterations=12)
     losses = [row.loss for row in result.rows]
     assert losses[-1] < 0.25 * losses[0]
@@ -37,25 +35,25 @@ def test_an_empty_volume_comes_closer_to_the_truth(ball_scene: Scene) -> None:
     assert result.rows[-1].test_psnr is not None
 
 
-def test_the_scene_itself_is_left_alone(ball_scene: Scene) -> None:
+def test_the_scene_itself_is_left_alone(ball_scene):
     before = ball_scene.volume.density.clone()
     optimize(ball_scene, iterations=2)
     assert torch.equal(ball_scene.volume.density, before)
     assert not ball_scene.volume.density.requires_grad
 
 
-def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
+def test_test_views_do_not_influence_the_result(ball_scene):
     views = [replace(view, image=view.image * (not view.is_test)) for view in ball_scene.views]
     spoiled = replace(ball_scene, views=views)
     one, other = (optimize(scene, iterations=3).scene.volume for scene in (ball_scene, spoiled))
     assert torch.equal(one.density, other.density)
 
 
-def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
+def test_a_view_of_weight_2_counts_as_two(ball_scene):
     first, second = ball_scene.views[:2]
     second = replace(second, image=first.image.flip(2))  # as bright, which is the unit of losses
 
-    def evaluate(*views: View) -> tuple[float, torch.Tensor]:
+    def evaluate(*views):
         run = Reconstruction(replace(ball_scene, views=[*views]), 1)
         evaluation = run.frames[0].evaluate()
         return evaluation.loss, evaluation.gradients["density"]
@@ -68,7 +66,7 @@ def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
     assert not torch.allclose(heavy[1], once[1], rtol=0, atol=1e-2 * size)
 
 
-def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
+def test_a_checkpoint_of_another_format_is_refused(tmp_path):
     torch.save({"format": 1, "scene": {}, "state": {}}, tmp_path / "last.pt")
     with pytest.raises(FormatError, match=f"of format 1; this version reads {FORMAT}"):
         load_checkpoint(tmp_path, {})
@@ -76,9 +74,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["loss of view", "derivative of the loss"])
-def test_divergence_keeps_the_last_good_state(
-    ball_scene: Scene, flaw: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_divergence_keeps_the_last_good_state(ball_scene, flaw, monkeypatch):
     """Where no candidate, however near, can be looked at."""
     run, again = Reconstruction(ball_scene), Reconstruction(ball_scene)
     run.step()
@@ -101,14 +97,12 @@ def test_divergence_keeps_the_last_good_state(
     assert torch.equal(run.parameters[0].value, again.parameters[0].value)
 
 
-def test_light_that_cannot_be_solved_for_shortens_a_step(
-    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_light_that_cannot_be_solved_for_shortens_a_step(ball_scene, monkeypatch):
     run, failed = Reconstruction(ball_scene), list[str]()
     run.step()
     candidate, evaluate = run.search.candidate, Frame.evaluate
 
-    def fail_once(frame: Frame) -> Evaluation:
+    def fail_once(frame):
         if not failed:
             failed.append("once")
             raise SolveError("no light", 9, 1.0, "")
@@ -120,7 +114,7 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(
     torch.testing.assert_close(run.parameters[0].value.detach().flatten(), candidate / 2)
 
 
-def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene: Scene) -> None:
+def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene):
     """Its row is of the volume that stays, as rows of others are."""
     run = Reconstruction(ball_scene)
     row, before = run.step(), run.parameters[0].value.detach().clone()
@@ -135,7 +129,7 @@ def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene: Scene) -
     assert after.psnr == pytest.approx(run.frames[0].evaluate().psnr, abs=0.01)
 
 
-def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
+def test_a_scene_without_training_images_is_refused(ball_scene):
     with pytest.raises(SceneError, match="nothing to reconstruct from"):
         tests = [view for view in ball_scene.views if view.is_test]
         Reconstruction(replace(ball_scene, views=tests))
@@ -144,14 +138,12 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("fewest", [16, 8, 4])
-def test_a_line_through_two_resolutions(
-    ball_scene, monkeypatch: pytest.MonkeyPatch, fewest: int
-) -> None:
+def test_a_line_through_two_resolutions(ball_scene, monkeypatch, fewest):
     """By a clock that counts 0.25 s and a millisecond a cell; twice that the first time."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", fewest)
     clock, known, evaluate = [0.0], set[int](), Frame.evaluate
 
-    def evaluate_slowly(frame: Frame) -> Evaluation:
+    def evaluate_slowly(frame):
         cells = frame.level.train.volume.grid.cells
         clock[0] += (0.25 + cells / 1000) * (1 if cells in known else 2)
         known.add(cells)
@@ -168,7 +160,7 @@ NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 
 
 @pytest.fixture
-def still() -> Scene:
+def still():
     """The ball, with numbers to find beside its density, in float64; cameras need more pictures."""
     sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
     overrides = ["optimize.iterations=4", "diffusion.transport_rounds=0", *sought]
@@ -176,7 +168,7 @@ def still() -> Scene:
     return scene_at_level(scene, 2)
 
 
-def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
+def values(run):
     return {p.name: p.value.detach() for p in run.parameters}
 
 
@@ -205,7 +197,7 @@ def test_neither_seed_nor_order_of_views_nor_brightness_matters(still):
 
 
 @pytest.mark.slow
-def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
+def test_copies_of_a_scene_find_what_it_finds_alone(still):
     single, together = Reconstruction(still), Reconstruction(still, others=[still])
     while not single.is_done:
         row, rows = single.step(), together.advance()
@@ -216,7 +208,7 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
+def test_volumes_differ_and_numbers_do_not(still):
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
     together = Reconstruction(still, others=[other])
     together.advance()

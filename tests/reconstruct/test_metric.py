@@ -38,7 +38,7 @@ class Curvature:
     weights: dict[str, torch.Tensor]
     matrix: torch.Tensor
 
-    def places(self, name: str) -> list[int]:
+    def places(self, name):
         """The rows of the entries of `name`."""
         sizes = [value.numel() for value in self.values.values()]
         start = sum(sizes[: [*self.values].index(name)])
@@ -46,7 +46,7 @@ class Curvature:
 
 
 @pytest.fixture(scope="module")
-def curvature() -> Curvature:
+def curvature():
     """Two views, of which one moves its camera and the other is exposed, in light of one number."""
     density = 0.3 + random_values(*CELLS)
     base = make_scene(density, g=0.3, ambient=(0.2, 0.3, 0.4), transport_rounds=0)
@@ -71,9 +71,7 @@ def curvature() -> Curvature:
     return Curvature(scene, parameters, values, weights, matrix)
 
 
-def test_it_is_the_part_of_the_matrix_between_numbers(
-    curvature: Curvature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_the_part_of_the_matrix_between_numbers(curvature, monkeypatch):
     """By differences: to first order in how long these are."""
     numbers = single_numbers(curvature.parameters)
     assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
@@ -90,7 +88,7 @@ def test_it_is_the_part_of_the_matrix_between_numbers(
     assert errors[0].abs().max() < 1e-3
 
 
-def diagonal_by(curvature: Curvature, probes: int, monkeypatch: pytest.MonkeyPatch) -> torch.Tensor:
+def diagonal_by(curvature, probes, monkeypatch):
     monkeypatch.setattr(tuning, "PROBES", probes)
     monkeypatch.setattr(tuning, "POWER", 1.0)
     point = Point(curvature.scene, curvature.values, curvature.weights, {})
@@ -98,9 +96,7 @@ def diagonal_by(curvature: Curvature, probes: int, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_it_is_the_mean_of_the_true_diagonal_over_neighbors(
-    curvature: Curvature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_the_mean_of_the_true_diagonal_over_neighbors(curvature, monkeypatch):
     true = curvature.matrix.diagonal()[curvature.places("density")].view(CELLS)
     wanted = torch.zeros_like(true)
     for z, y, x in product(*map(range, CELLS)):
@@ -113,9 +109,7 @@ def test_it_is_the_mean_of_the_true_diagonal_over_neighbors(
     assert errors[1] < 0.15 and errors[1] < 0.5 * errors[0]
 
 
-def test_what_no_picture_shows_is_held_by_a_part_of_what_they_show(
-    curvature: Curvature, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_no_picture_shows_is_held_by_a_part_of_what_they_show(curvature, monkeypatch):
     monkeypatch.setattr(tuning, "FLOOR", 0.0)
     bare = diagonal_by(curvature, 1, monkeypatch)
     least = 0.9 * float(bare.square().mean().sqrt())
@@ -125,9 +119,7 @@ def test_what_no_picture_shows_is_held_by_a_part_of_what_they_show(
 
 
 @pytest.mark.parametrize(("name", "colors"), [("density", ()), ("emission", (3,))])
-def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(
-    name: str, colors: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(name, colors, monkeypatch):
     """Against the dense matrix: H plus the curvature of smoothing, of free rows and columns."""
     monkeypatch.setattr(tuning, "CYCLES", 30)
     monkeypatch.setattr(tuning, "HELD", 1e9)
@@ -137,7 +129,7 @@ def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(
     diagonal, residuals = 1e-3 + random_values(*shape), random_values(2, *shape, seed=2)
     free = (random_values(*shape, seed=3) > 0.3).double()
 
-    def smoothing(x: torch.Tensor) -> torch.Tensor:
+    def smoothing(x):
         return 0.1 * total_variation(x.view(shape) / 0.7, grid, parameter.knee)
 
     curvature = torch.autograd.functional.hessian(smoothing, value.flatten())

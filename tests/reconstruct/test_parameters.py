@@ -15,7 +15,7 @@ from ddrecon.settings import ParameterSettings
 GRID = box_grid((4, 6, 5))
 
 
-def test_values_stay_within_bounds_and_support_and_what_would_leave_them_is_not_free() -> None:
+def test_values_stay_within_bounds_and_support_and_what_would_leave_them_is_not_free():
     value = random_values(*GRID.shape) - 0.5
     parameter = Parameter("density", ParameterSettings(max=0.3), value, GRID)
     parameter.restrict(random_values(*GRID.shape, seed=1) > 0.5)
@@ -29,17 +29,17 @@ def test_values_stay_within_bounds_and_support_and_what_would_leave_them_is_not_
     assert bool(is_free.any())
 
 
-def test_a_direction_keeps_its_length() -> None:
+def test_a_direction_keeps_its_length():
     value = torch.tensor([1.0, -2.0, 2.0])
     parameter = Parameter("lights.0.direction", ParameterSettings(), value, GRID)
     moved = parameter.project(value + torch.tensor([0.3, 0.1, -0.2]))
     assert float(moved.norm()) == pytest.approx(3.0)
 
 
-def test_what_a_move_changes_is_the_same_at_a_finer_resolution() -> None:
+def test_what_a_move_changes_is_the_same_at_a_finer_resolution():
     """The product of a move and of a change of the derivative, but for the blur of both."""
 
-    def miss(cells: int) -> float:
+    def miss(cells):
         grid, finer = box_grid((cells, 2, 3)), box_grid((2 * cells, 4, 5))
         place = (torch.arange(cells).double() + 0.5) / cells
         move, slope = (w[:, None, None].expand(grid.shape) for w in (place.sin(), place.exp()))
@@ -51,10 +51,10 @@ def test_what_a_move_changes_is_the_same_at_a_finer_resolution() -> None:
     assert miss(16) > 3.5 * miss(32) > 0
 
 
-def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order() -> None:
+def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order():
     """Interpolation alone blurs by the second power of a cell's width."""
 
-    def lost(cells: int) -> float:
+    def lost(cells):
         grid, finer = box_grid((cells, 2, 2)), box_grid((2 * cells, 4, 4))
         place = (torch.arange(cells).double() + 0.5) / cells
         wave = (2 + (2 * math.pi * place).cos())[:, None, None].expand(grid.shape)
@@ -65,32 +65,32 @@ def test_a_finer_field_keeps_the_means_of_the_coarser_to_fourth_order() -> None:
     assert lost(16) > 14 * lost(32) > 0
 
 
-def box(cells: int, side: float = 1.0) -> Grid:
+def box(cells, side=1.0):
     return Grid((cells,) * 3, (0.0,) * 3, (side,) * 3)
 
 
 @pytest.mark.parametrize("cells", [8, 16, 32])
-def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells: int) -> None:
+def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells):
     grid = box(cells)
     ramp = 2 * grid.centers(torch.zeros(1, dtype=torch.float64))[2].expand(*grid.shape)
     inner = (cells - 1) / cells
     assert float(total_variation(ramp, grid)) == pytest.approx(2 * inner, rel=0.01)
 
 
-def test_total_variation_does_not_depend_on_world_scale() -> None:
+def test_total_variation_does_not_depend_on_world_scale():
     field = random_values(6, 6, 6)
     one, other = (float(total_variation(field, box(6, side))) for side in (1.0, 7.0))
     assert one == pytest.approx(other, rel=1e-12)
 
 
 @pytest.mark.parametrize("knee", [None, 0.1])
-def test_total_variation_has_a_finite_derivative_where_flat(knee: float | None) -> None:
+def test_total_variation_has_a_finite_derivative_where_flat(knee):
     field = torch.zeros(4, 4, 4, requires_grad=True)
     total_variation(field, box(4), knee).backward()
     assert torch.isfinite(field.grad).all()
 
 
-def test_a_knee_compresses_densities_above_it() -> None:
+def test_a_knee_compresses_densities_above_it():
     """By log(1 + x / knee) / 3; the derivative is exact."""
     field, grid = random_values(3, 4, 5).requires_grad_(), Grid((3, 4, 5), (0, 0, 0), (1, 1, 1))
     compressed = total_variation((1 + field / 0.1).log() / 3, grid)
@@ -98,7 +98,7 @@ def test_a_knee_compresses_densities_above_it() -> None:
     assert torch.autograd.gradcheck(lambda x: total_variation(x, grid, 0.1), field)
 
 
-def stiffness_matrix(field: torch.Tensor, grid: Grid, knee: float | None) -> torch.Tensor:
+def stiffness_matrix(field, grid, knee):
     """R, column by column."""
     faces, slope = face_stiffness(field, grid, knee)
     slope = torch.ones_like(field) if slope is None else slope
@@ -113,9 +113,7 @@ def stiffness_matrix(field: torch.Tensor, grid: Grid, knee: float | None) -> tor
 
 
 @pytest.mark.parametrize("periodic", [(), (0, 2)])
-def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(
-    periodic: tuple[int, ...],
-) -> None:
+def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(periodic):
     field = random_values(4, 3, 5)
     grid = replace(make_scene(field).volume.grid, periodic=periodic)
     stiffness = stiffness_matrix(field, grid, None)
@@ -129,7 +127,7 @@ def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(
             assert total_variation(field + step.view_as(field), grid) <= parabola + 1e-12
 
 
-def test_smoothing_does_not_depend_on_where_a_period_begins() -> None:
+def test_smoothing_does_not_depend_on_where_a_period_begins():
     field, shift = random_values(4, 3, 5), (1, 2)
     grid = replace(make_scene(field).volume.grid, periodic=(0, 2))
     moved = field.roll(shift, (0, 2))
@@ -141,11 +139,11 @@ def test_smoothing_does_not_depend_on_where_a_period_begins() -> None:
 
 
 @pytest.mark.parametrize("density", [0.0, 0.05, 2.0])
-def test_stiffness_is_the_curvature_of_an_even_density(density: float) -> None:
+def test_stiffness_is_the_curvature_of_an_even_density(density):
     field = torch.full((3, 4, 5), density, dtype=torch.float64)
     grid = make_scene(field).volume.grid
 
-    def variation(x: torch.Tensor) -> torch.Tensor:
+    def variation(x):
         return total_variation(x.view(3, 4, 5), grid, 0.1)
 
     curvature = torch.autograd.functional.hessian(variation, field.flatten())

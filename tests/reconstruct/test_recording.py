@@ -1,7 +1,6 @@
 """A recorded iteration is the plain one, whatever the values are by then."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -9,44 +8,40 @@ import torch
 from media import make_scene, random_values
 from scenes import three_views
 from tape import record
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import LOG, use_engine
 from ddrecon.losses import Target
-from ddrecon.reconstruct.gradients import Differentiated, Record, Recording, Replays, differentiate
+from ddrecon.reconstruct.gradients import Recording, Replays, differentiate
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of
 
 NAMES = "density", "albedo", "lights.0.irradiance"
 
 
 @pytest.fixture(params=["torch", "warp"])
-def scene(request: pytest.FixtureRequest) -> Scene:
+def scene(request):
     use_engine(request.param)
     settings = {"ambient": (0.2, 0.3, 0.4), "transport_rounds": 1, "tolerance": 1e-12}
     scene = three_views(make_scene(random_values(5, 4, 6), **settings))
     return replace(scene, render=replace(scene.render, tolerance=0))
 
 
-def leaves_of(scene: Scene, factor: float = 1.0) -> dict[str, Tensor]:
+def leaves_of(scene, factor=1.0):
     return {name: (factor * value_of(scene, name)).detach().requires_grad_() for name in NAMES}
 
 
-def compare(scene: Scene, *names: str) -> Comparison:
+def compare(scene, *names):
     targets = {view.name: Target.of(view.image, None) for view in scene.views}
     return Comparison([scene.view(name) for name in names], targets)
 
 
-def differentiate_plainly(
-    scene: Scene, values: Mapping[str, Tensor], *names: str
-) -> Differentiated:
+def differentiate_plainly(scene, values, *names):
     return differentiate(scene, names, values, compare(scene, *names), SolveMemory())
 
 
-def assert_same(objective: Differentiated, plain: Differentiated) -> None:
+def assert_same(objective, plain):
     torch.testing.assert_close(objective.loss, plain.loss, rtol=1e-10, atol=0)
     torch.testing.assert_close(objective.images, plain.images, rtol=1e-10, atol=1e-12)
     for name, bar in objective.gradients.items():
@@ -55,7 +50,7 @@ def assert_same(objective: Differentiated, plain: Differentiated) -> None:
 
 
 @pytest.mark.slow
-def test_replays_are_plain_iterations(scene: Scene) -> None:
+def test_replays_are_plain_iterations(scene):
     """Of other values and views than those that were recorded, and after other views."""
     memory = SolveMemory()
     differentiate(scene, ["one"], leaves_of(scene), compare(scene, "one"), memory)
@@ -70,7 +65,7 @@ def test_replays_are_plain_iterations(scene: Scene) -> None:
         assert list(compared.pictures) == names
 
 
-def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
+def test_a_solve_that_needs_more_iterations_is_told(scene):
     memory = SolveMemory()
     differentiate(scene, ["one"], leaves_of(scene), compare(scene, "one"), memory)
     memory.iterations = dict.fromkeys(memory.iterations, 1)
@@ -85,9 +80,7 @@ def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
     assert len(compared.psnrs) == 1
 
 
-def test_what_cannot_be_recorded_runs_plainly(
-    scene: Scene, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_recorded_runs_plainly(scene, caplog):
     """A camera that is sought looks at other rays in each iteration."""
     caplog.set_level("WARNING", LOG)  # a quiet command before this would have no warnings
     memory, values = SolveMemory(), leaves_of(scene)
@@ -102,7 +95,7 @@ def test_what_cannot_be_recorded_runs_plainly(
 
 
 @pytest.mark.slow
-def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene: Scene) -> None:
+def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene):
     """It records anew what the whole run has recorded before."""
     use_engine("warp")
     render = replace(ball_scene.render, tolerance=0)
@@ -110,8 +103,8 @@ def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene: Scen
 
     recorded = list[Reconstruction]()
 
-    def advance(run: Reconstruction, count: int) -> None:
-        def new_recorder() -> Record:
+    def advance(run, count):
+        def new_recorder():
             recorded.append(run)
             return record
 

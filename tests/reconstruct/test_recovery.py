@@ -24,7 +24,7 @@ BLOBS = (0.0, 0.0, 0.0, 0.3), (0.15, 0.1, 0.05, 0.2), (-0.2, -0.05, 0.1, 0.18)
 BLOBS += ((0.0, 0.15, -0.15, 0.2),)
 
 
-def cloud(cells: int) -> Volume:
+def cloud(cells):
     """A cloud of four soft blobs, lopsided, with empty space around it."""
     grid = Grid((cells, cells, cells), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     z, y, x = grid.centers(torch.zeros(1))
@@ -37,13 +37,13 @@ def cloud(cells: int) -> Volume:
     return Volume(grid, density, *sigmas, torch.tensor(0.2))
 
 
-def camera(turn: float, height: float, pixels: int) -> Camera:
+def camera(turn, height, pixels):
     eye = torch.tensor([2.5 * math.sin(turn), height, 2.5 * math.cos(turn)])
     pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     return Camera(pose, (pixels, pixels), 0.27)
 
 
-def scene_of(volume: Volume, views: int, pixels: int) -> Scene:
+def scene_of(volume, views, pixels):
     lights = [
         DirectionalLight(torch.tensor([-1.0, -2.0, -1.0]), torch.tensor([3.0, 2.5, 2.0])),
         AmbientLight(torch.tensor([0.1, 0.12, 0.15])),
@@ -56,7 +56,7 @@ def scene_of(volume: Volume, views: int, pixels: int) -> Scene:
     return Scene(volume, lights, seen, diffusion=diffusion)
 
 
-def photographed(scene: Scene) -> Scene:
+def photographed(scene):
     """`scene` with its own pictures as targets."""
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
@@ -64,16 +64,14 @@ def photographed(scene: Scene) -> Scene:
     return replace(scene, views=[replace(view, image=image) for view, image in pairs])
 
 
-def recovered(
-    scene: Scene, starts: dict[str, Tensor], iterations: int, **settings: ParameterSettings
-) -> Scene:
+def recovered(scene, starts, iterations, **settings):
     """What the loop makes of `scene` from `starts`, by defaults unless given."""
     parameters = {name: settings.get(name, ParameterSettings()) for name in starts}
     wanted = OptimizeSettings(parameters, iterations)
     return optimize(replace(scene, starts=starts, optimize=wanted)).scene
 
 
-def image_error(scene: Scene, truth: Scene) -> float:
+def image_error(scene, truth):
     with torch.no_grad():
         found, wanted = (
             torch.stack(render_each(item, item.views, SolveMemory())) for item in (scene, truth)
@@ -99,7 +97,7 @@ STARTS: dict[str, Tensor] = {
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_a_number_alone_comes_back(name: str) -> None:
+def test_a_number_alone_comes_back(name):
     scene = photographed(scene_of(cloud(9), 3, 10))
     truth, start = value_of(scene, name), STARTS[name]
     result = recovered(scene, {name: start}, 30)
@@ -113,11 +111,11 @@ def test_a_number_alone_comes_back(name: str) -> None:
     assert float((found - truth).norm()) < 0.01 * float((start - truth).norm())
 
 
-def pose_of(scene: Scene) -> Tensor:
+def pose_of(scene):
     return scene.view("view_1").camera.pose
 
 
-def test_all_together_render_as_the_truth() -> None:
+def test_all_together_render_as_the_truth():
     """Also with the density, which then has light and medium to share its level with.
 
     The way there depends on rounding: of densities that begin 1e-5 apart, 120 iterations leave 0.07
@@ -130,7 +128,7 @@ def test_all_together_render_as_the_truth() -> None:
     assert image_error(found, scene) < 0.12
 
 
-def test_a_phase_function_that_scatters_backward() -> None:
+def test_a_phase_function_that_scatters_backward():
     """The paper's cloud by diffusion: started at 0.67, the truth being -0.802 (it found -0.813)."""
     sigmas = {"sigma_a": torch.full((3,), 0.1), "sigma_s": torch.full((3,), 40.0)}
     volume = replace(cloud(12), phase=torch.tensor(-0.802), **sigmas)

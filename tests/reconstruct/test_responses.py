@@ -13,9 +13,7 @@ from ddrecon.scene import View
 @pytest.mark.parametrize(
     ("gain", "offset"), [([1.3], [0.02]), ([1.3, 0.8, 1.1], [0.02, 0.0, 0.01]), ([0.7], [0.01] * 3)]
 )
-def test_the_response_of_a_picture_is_found(
-    loss: str, gain: list[float], offset: list[float]
-) -> None:
+def test_the_response_of_a_picture_is_found(loss, gain, offset):
     """Whatever response it was rendered with, and whatever a mask hides."""
     light = 0.5 * torch.rand(3, 12, 10, dtype=torch.float64)
     true = {"exposure": torch.tensor(gain).double(), "offset": torch.tensor(offset).double()}
@@ -30,13 +28,13 @@ def test_the_response_of_a_picture_is_found(
     torch.testing.assert_close(found, true, rtol=1e-4, atol=1e-5)
 
 
-def test_a_black_render_keeps_its_response() -> None:
+def test_a_black_render_keeps_its_response():
     target, view = Target.of(torch.rand(3, 4, 5).double(), None), View("test", make_camera())
     _, found = fit_held_out(torch.zeros(3, 4, 5).double(), view, target, {"exposure": 1})
     assert found["exposure"].tolist() == [1.0]
 
 
-def test_a_held_out_picture_is_never_shown_worse_for_its_response() -> None:
+def test_a_held_out_picture_is_never_shown_worse_for_its_response():
     """A haze over a quarter of the black: least squares, which count the dark most, darken all."""
     image = torch.zeros(3, 8, 8, dtype=torch.float64)
     image[:, :, :4] = 0.3

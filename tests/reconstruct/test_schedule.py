@@ -3,18 +3,16 @@
 import json
 from dataclasses import asdict, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from media import box_grid
 
-from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, Stage, find_stages
 from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST
-from ddrecon.scene import Scene
 from ddrecon.settings import AUTO, ParameterSettings
 
 STAGES = [Stage(0), Stage(1), Stage(2)]
@@ -23,16 +21,16 @@ STAGES = [Stage(0), Stage(1), Stage(2)]
 class FakeSearch(SimpleNamespace):
     """A search whose loss of images is `loss`, with a prior, and that can still gain `gain`."""
 
-    def __init__(self, loss: float, gain: float, prior: float = 1.0):
+    def __init__(self, loss, gain, prior=1.0):
         super().__init__(
             gain=gain, moves=1, weight=1.0, objective=SimpleNamespace(loss=loss, prior=prior)
         )
 
-    def reweigh(self, weight: float) -> None:
+    def reweigh(self, weight):
         self.weight = weight
 
 
-def drive(schedule: Schedule, gain: float, loss: float = 1.0) -> list[int]:
+def drive(schedule, gain, loss=1.0):
     """The levels of the iterations until `schedule` is over, by a search that stays as it is."""
     levels, search = list[int](), FakeSearch(loss, gain)
     while not schedule.is_over(len(levels)):
@@ -41,7 +39,7 @@ def drive(schedule: Schedule, gain: float, loss: float = 1.0) -> list[int]:
     return levels
 
 
-def test_a_stage_ends_at_rest_and_the_last_one_ends_the_run() -> None:
+def test_a_stage_ends_at_rest_and_the_last_one_ends_the_run():
     schedule = Schedule(AUTO, STAGES)
     # The prior counts half as much once, and the loss does not fall by that.
     assert drive(schedule, 0.9 * REST) == [0, 1, 2, 2]
@@ -49,9 +47,7 @@ def test_a_stage_ends_at_rest_and_the_last_one_ends_the_run() -> None:
 
 
 @pytest.mark.parametrize(("iterations", "most"), [(AUTO, MOST_ITERATIONS), (50, 50), (1, 1)])
-def test_a_run_that_never_rests_ends_at_its_bound_at_full_resolution(
-    iterations: Any, most: int
-) -> None:
+def test_a_run_that_never_rests_ends_at_its_bound_at_full_resolution(iterations, most):
     """Later stages have at least half of what is left."""
     schedule = Schedule(iterations, STAGES)
     levels = drive(schedule, 1.1 * REST)
@@ -60,7 +56,7 @@ def test_a_run_that_never_rests_ends_at_its_bound_at_full_resolution(
     assert schedule.ending(most)["kind"] == ("bound" if iterations == AUTO else "iterations")
 
 
-def test_the_prior_is_halved_until_the_loss_is_the_noise() -> None:
+def test_the_prior_is_halved_until_the_loss_is_the_noise():
     """Or hardly falls by that: by less than the power `ELASTICITY` of its weight."""
     for noise, power, halved in ((0.3, 0.5, 4), (0.0, 0.9 * ELASTICITY, 1)):
         schedule, search, made = Schedule(AUTO, STAGES[:1]), FakeSearch(1.0, 0.0), 0
@@ -72,7 +68,7 @@ def test_the_prior_is_halved_until_the_loss_is_the_noise() -> None:
         assert search.weight == 2.0**-halved
 
 
-def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
+def test_a_schedule_goes_on_as_if_it_had_never_stopped():
     random = torch.rand(MOST_ITERATIONS, generator=torch.Generator().manual_seed(3)).tolist()
     whole, parts, count = Schedule(AUTO, STAGES), Schedule(AUTO, STAGES), 0
     while not whole.is_over(count):
@@ -97,8 +93,8 @@ def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
     ],
 )
 def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
-    ball_scene: Scene, others: list[str], lights: list[Light], waiting: set[str]
-) -> None:
+    ball_scene, others, lights, waiting
+):
     """In the dark, or alone, glow is all that pictures can show; light from one side tells all."""
     grid, scene = box_grid((4, 4, 4)), replace(ball_scene, lights=lights)
     empty = torch.zeros(grid.shape)
@@ -117,7 +113,7 @@ def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
 
 
 @pytest.mark.slow
-def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
+def test_a_run_rests_within_the_noise_that_is_known(ball_scene):
     run = Reconstruction(ball_scene, AUTO)
     while not run.is_done:
         run.step()
@@ -125,15 +121,13 @@ def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
     assert ending["kind"] == "rest" and ending["residual"] < 3 * ending["noise"]
 
 
-def test_what_is_cut_short_has_no_trial() -> None:
+def test_what_is_cut_short_has_no_trial():
     stages = [Stage(0), Stage(0, is_trial=True), Stage(1)]
     assert drive(Schedule(8, stages), 1.1 * REST) == [0] * 4 + [1] * 4
 
 
 @pytest.mark.parametrize(("prior", "levels"), [(0.4, [0, 1, 2]), (0.6, [0, 1, 1, 2, 2])])
-def test_noise_is_not_fitted_on_refined_grids_where_the_prior_is_light(
-    prior: float, levels: list[int]
-) -> None:
+def test_noise_is_not_fitted_on_refined_grids_where_the_prior_is_light(prior, levels):
     """A loss of 1 is that of noise; the search itself could gain more."""
     schedule, made = Schedule(6, STAGES), list[int]()
     while not schedule.is_over(len(made)) and len(made) < len(levels):
@@ -144,7 +138,7 @@ def test_noise_is_not_fitted_on_refined_grids_where_the_prior_is_light(
     assert schedule.ending(len(made))["kind"] == ("noise" if prior < 0.5 else "iterations")
 
 
-def test_no_stage_ends_before_something_has_moved() -> None:
+def test_no_stage_ends_before_something_has_moved():
     """Runs of few iterations came to nothing: each stage looked where it began, and was over."""
     schedule, search = Schedule(3, STAGES), FakeSearch(1.0, 1.1 * REST)
     search.moves = 0

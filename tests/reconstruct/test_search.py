@@ -1,21 +1,18 @@
 """The search for a minimum within bounds, of quadratics and of what bends more."""
 
 import io
-from collections.abc import Callable
 
 import pytest
 import torch
 from media import random_values
-from torch import Tensor
 
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.search import Objective, Search, Space
 
 COUNT = 12
-Function = Callable[[Tensor], Tensor]
 
 
-def positive_matrix() -> Tensor:
+def positive_matrix():
     """A matrix whose eigenvalues spread over three decades."""
     basis = torch.linalg.qr(random_values(COUNT, COUNT) - 0.5)[0]
     return basis @ torch.logspace(-1, 2, COUNT).double().diag() @ basis.T
@@ -25,18 +22,18 @@ MATRIX = positive_matrix()
 TARGET = random_values(COUNT, seed=1) - 0.3
 
 
-def quadratic(x: Tensor) -> Tensor:
+def quadratic(x):
     return (x - TARGET) @ MATRIX @ (x - TARGET) / 2
 
 
-def rosenbrock(x: Tensor) -> Tensor:
+def rosenbrock(x):
     return (100 * (x[1::2] - x[::2] ** 2) ** 2 + (1 - x[::2]) ** 2).sum()
 
 
-def space_of(metric: Tensor, low: float) -> Space:
+def space_of(metric, low):
     """Entries at least `low` in the diagonal `metric`."""
 
-    def free(values: Tensor, slope: Tensor) -> Tensor:
+    def free(values, slope):
         return (~((values <= low) & (slope > 0))).to(values)
 
     return Space(
@@ -47,7 +44,7 @@ def space_of(metric: Tensor, low: float) -> Space:
     )
 
 
-def objective_of(function: Function, x: Tensor, prior: Function | None = None) -> Objective:
+def objective_of(function, x, prior=None):
     """The objective at `x`, whose `prior` is none unless given."""
     leaf = x.clone().requires_grad_()
     loss = function(leaf)
@@ -59,13 +56,13 @@ def objective_of(function: Function, x: Tensor, prior: Function | None = None) -
     return Objective(float(loss), float(penalty), slope, bar)
 
 
-def begin(function: Function, x: Tensor, space: Space, prior: Function | None = None) -> Search:
+def begin(function, x, space, prior=None):
     search = Search(space, x)
     search.judge(objective_of(function, x, prior))
     return search
 
 
-def advance(search: Search, function: Function, count: int) -> Tensor:
+def advance(search, function, count):
     """Where `search` is after `count` candidates, or when no step helps."""
     for _ in range(count):
         if not search.is_stuck:
@@ -74,7 +71,7 @@ def advance(search: Search, function: Function, count: int) -> Tensor:
 
 
 @pytest.mark.parametrize("low", [-10.0, 0.0])
-def test_a_quadratic_within_bounds_is_solved(low: float) -> None:
+def test_a_quadratic_within_bounds_is_solved(low):
     """What is not at a bound has no slope, and what is there would go beyond."""
     search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), low))
     x = advance(search, quadratic, 100)
@@ -85,7 +82,7 @@ def test_a_quadratic_within_bounds_is_solved(low: float) -> None:
     assert float(slope[~is_held].abs().max()) < 1e-6 * scale and bool((slope[is_held] > 0).all())
 
 
-def test_its_loss_never_rises_and_reaches_the_end_of_a_curved_valley() -> None:
+def test_its_loss_never_rises_and_reaches_the_end_of_a_curved_valley():
     space = space_of(torch.ones(COUNT).double(), -10.0)
     search, losses = begin(rosenbrock, -torch.ones(COUNT).double(), space), list[float]()
     while search.loss > 1e-12:
@@ -95,7 +92,7 @@ def test_its_loss_never_rises_and_reaches_the_end_of_a_curved_valley() -> None:
     assert losses == sorted(losses, reverse=True)
 
 
-def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope() -> None:
+def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope():
     """The matrix of Broyden, Fletcher, Goldfarb and Shanno, updated pair by pair as a whole."""
     metric = 1 + random_values(COUNT, seed=2)
     search = begin(rosenbrock, random_values(COUNT, seed=3), space_of(metric, -10.0))
@@ -114,13 +111,13 @@ def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope()
     assert search.gains[-1] == pytest.approx(float(slope @ inverse @ slope) / 2 / search.loss)
 
 
-def test_units_of_unknowns_change_nothing() -> None:
+def test_units_of_unknowns_change_nothing():
     """Where the metric is in the same units."""
     unit, start = 10 ** (4 * random_values(COUNT, seed=4) - 2), random_values(COUNT, seed=3)
     metric = 1 + random_values(COUNT, seed=2)
     plain = begin(rosenbrock, start, space_of(metric, -10.0))
 
-    def scaled(x: Tensor) -> Tensor:
+    def scaled(x):
         return rosenbrock(x * unit)
 
     other = begin(scaled, start / unit, space_of(metric * unit**2, -1e9))
@@ -130,7 +127,7 @@ def test_units_of_unknowns_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("loss", [float("nan"), float("inf"), 1e9])
-def test_a_candidate_that_is_no_better_shortens_the_step(loss: float) -> None:
+def test_a_candidate_that_is_no_better_shortens_the_step(loss):
     search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), -10.0))
     before, step, values = search.loss, search.step, search.values
     nothing = torch.full((COUNT,), torch.nan).double()
@@ -144,10 +141,10 @@ def test_a_candidate_that_is_no_better_shortens_the_step(loss: float) -> None:
     assert search.is_stuck and search.gain == 0.0 and search.values is values
 
 
-def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has() -> None:
+def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has():
     """So a search whose prior is reweighed goes on as if it had always had that weight."""
 
-    def prior(x: Tensor) -> Tensor:
+    def prior(x):
         return x.square().sum()
 
     start, space = random_values(COUNT, seed=3), space_of(MATRIX.diagonal(), -10.0)
@@ -164,7 +161,7 @@ def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has() -> None:
     assert search.slope == pytest.approx(float(search.direction @ slope)) and search.slope < 0
 
 
-def test_a_search_goes_on_from_its_state_to_the_same_bits() -> None:
+def test_a_search_goes_on_from_its_state_to_the_same_bits():
     space = space_of(torch.ones(COUNT).double(), -10.0)
     whole = begin(rosenbrock, random_values(COUNT, seed=3), space)
     for _ in range(15):

@@ -10,11 +10,10 @@ from ddrecon.errors import FormatError, SceneError
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import Problem, choose_loss, targets_of
-from ddrecon.scene import Scene
 from ddrecon.settings import NoiseSettings, ParameterSettings
 
 
-def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: Scene) -> None:
+def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene):
     """Masks that leave no pixel, black pictures, and no light at all; one of each is enough."""
     scene, (first, *others) = ball_scene, ball_scene.views
     black = [replace(view, mask=torch.zeros(view.camera.size)) for view in others]
@@ -40,20 +39,18 @@ def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: 
             Reconstruction(replace(scene, **change))
 
 
-def with_steps(scene: Scene, *steps: float) -> Scene:
+def with_steps(scene, *steps):
     views = [replace(view, step=step) for view, step in zip(scene.views, steps, strict=False)]
     return replace(scene, views=views)
 
 
-def test_files_of_srgb_are_compared_as_displayed_and_linear_ones_as_they_are(
-    ball_scene: Scene,
-) -> None:
+def test_files_of_srgb_are_compared_as_displayed_and_linear_ones_as_they_are(ball_scene):
     assert ball_scene.optimize is not None
     assert choose_loss(ball_scene.optimize, with_steps(ball_scene, 1 / 255, 1 / 65535)) == "display"
     assert choose_loss(ball_scene.optimize, with_steps(ball_scene, 0, 0)) == "l2"
 
 
-def test_pictures_of_both_kinds_need_a_loss(ball_scene: Scene) -> None:
+def test_pictures_of_both_kinds_need_a_loss(ball_scene):
     mixed = with_steps(ball_scene, 0, 1 / 255)
     assert ball_scene.optimize is not None
     with pytest.raises(SceneError, match="say how to compare them"):
@@ -61,7 +58,7 @@ def test_pictures_of_both_kinds_need_a_loss(ball_scene: Scene) -> None:
     assert choose_loss(replace(ball_scene.optimize, loss="photon"), mixed) == "photon"
 
 
-def test_photon_counts_errors_in_units_of_the_noise_that_is_given(ball_scene: Scene) -> None:
+def test_photon_counts_errors_in_units_of_the_noise_that_is_given(ball_scene):
     """The mean square error over read^2 + shot times radiance."""
     flat = torch.full_like(ball_scene.views[0].image, 0.5)
     noise = NoiseSettings(read=0.3, shot=0.2)

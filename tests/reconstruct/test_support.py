@@ -18,7 +18,7 @@ from ddrecon.pictures import decode
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support, describe_support, support_text
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
@@ -34,7 +34,7 @@ CAMERAS["fisheye"] = replace(WIDE, lens="fisheye", distortion=LENSES["fisheye"])
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_projection_is_the_inverse_of_casting_rays(name: str) -> None:
+def test_projection_is_the_inverse_of_casting_rays(name):
     """A point on a pixel's ray is seen at the pixel's center, as far off as it was put."""
     camera = CAMERAS[name]
     rays = cast_rays(camera)
@@ -49,7 +49,7 @@ def test_projection_is_the_inverse_of_casting_rays(name: str) -> None:
         torch.testing.assert_close(distance, far, rtol=1e-12, atol=0)
 
 
-def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
+def test_what_lies_behind_or_far_outside_is_not_seen():
     """Also where a polynomial would fold it back into the image."""
     camera = replace(CAMERAS["opencv"], distortion=torch.tensor([-0.5, 0, 0, 0, 0, 0]).double())
     backward, origin = camera.pose[:, 2], camera.pose[:, 3]
@@ -59,7 +59,7 @@ def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> None:
+def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name):
     """Rays of pixels that show something cross only the hull; with nothing shown none stays."""
     camera, grid = CAMERAS[name], box_grid((7, 6, 8))
     shown = torch.rand(camera.size, generator=torch.Generator().manual_seed(1)) > 0.995
@@ -83,7 +83,7 @@ def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> 
     assert bool(everything.all()) and torch.equal(is_seen.flatten(), seen)
 
 
-def test_a_hull_grows_with_margin_and_with_cells() -> None:
+def test_a_hull_grows_with_margin_and_with_cells():
     camera = CAMERAS["pinhole"]
     shown = torch.zeros(camera.size, dtype=torch.bool)
     shown[15, 18] = True
@@ -97,12 +97,12 @@ def test_a_hull_grows_with_margin_and_with_cells() -> None:
     assert bool((fine | ~(hulls[0] & is_seen)).all())
 
 
-def ball(*overrides: str) -> Scene:
+def ball(*overrides):
     return load_scene(BALL, overrides=["optimize.iterations=8", *overrides])
 
 
 @pytest.mark.slow
-def test_outside_of_its_support_a_volume_stays_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outside_of_its_support_a_volume_stays_empty(monkeypatch):
     """At every level, whatever `min` says, and rays know it; and the ball itself is inside."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 6)
     scene = ball("optimize.parameters.density={support: masks, support_margin: 1, min: 0.01}")
@@ -125,7 +125,7 @@ def test_outside_of_its_support_a_volume_stays_empty(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("read", [0.002, 0.01])
-def test_auto_tells_black_from_faint_smoke_by_the_noise(read: float) -> None:
+def test_auto_tells_black_from_faint_smoke_by_the_noise(read):
     """Black is not shown but for one pixel in a thousand; what is 8 deviations above it is."""
     generator = torch.Generator().manual_seed(3)
     image = 0.02 + read * torch.randn(3, 120, 90, generator=generator)
@@ -136,7 +136,7 @@ def test_auto_tells_black_from_faint_smoke_by_the_noise(read: float) -> None:
     assert shown[faint].float().mean() > 0.99 and shown[~faint].float().mean() < 0.001
 
 
-def speckle(block: int, share: float) -> torch.Tensor:
+def speckle(block, share):
     """[320, 320]: 1 to 3 in this `share` of pixels, half of some blocks, and 0 in others."""
     generator = torch.Generator().manual_seed(2)
     values = torch.randint(1, 4, (320, 320), generator=generator).float()
@@ -151,9 +151,7 @@ def speckle(block: int, share: float) -> torch.Tensor:
     ("uneven", "block", "share"),
     [(0, 1, 0.01), (0, 4, 0.01), (0, 1, 0.2), (50, 1, 0)],
 )
-def test_auto_takes_no_noise_of_compression_for_smoke(
-    uneven: float, block: int, share: float
-) -> None:
+def test_auto_takes_no_noise_of_compression_for_smoke(uneven, block, share):
     """A picture of 8 bits shows a cloud, how `uneven` it may be, its faint stem, and no noise."""
     y, x = torch.arange(320)[:, None], torch.arange(320)
     cloud = (x - 160) ** 2 + (y - 120) ** 2 < 80**2
@@ -171,7 +169,7 @@ def test_auto_takes_no_noise_of_compression_for_smoke(
 
 
 @pytest.mark.parametrize(("shift", "lonely"), [(0, 0), (0.5, 0.5), (1, 1)])
-def test_cells_that_one_view_sees_are_told(shift: float, lonely: float) -> None:
+def test_cells_that_one_view_sees_are_told(shift, lonely):
     """Of two parallel cameras beside each other, by a part of the box, each sees a part alone."""
     grid = Grid((4, 4, 8), (-0.5,) * 3, (0.5,) * 3)
     camera = make_camera((0, 0, 2.5), (8, 8), half_width=0.5, is_perspective=False)
@@ -184,14 +182,14 @@ def test_cells_that_one_view_sees_are_told(shift: float, lonely: float) -> None:
     assert ("ghosts" in support_text(described)) == (lonely > 0)
 
 
-def refusal(scene: Scene) -> str:
+def refusal(scene):
     with pytest.raises(SceneError) as caught:
         Reconstruction(scene)
     (line,) = caught.value.problems
     return line
 
 
-def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
+def test_masks_that_empty_the_hull_are_refused_in_one_line():
     scene = ball("optimize.parameters.density={support: masks, support_margin: 0}")
     views = []
     for index, view in enumerate(scene.views):
@@ -206,6 +204,6 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
     assert "shows nothing at all, by its mask" in refusal(replace(scene, views=views))
 
 
-def test_what_is_no_support_is_refused() -> None:
+def test_what_is_no_support_is_refused():
     with pytest.raises(SceneError, match=r"g\.support: 'masks' is for density alone"):
         ball("optimize.parameters.g={support: masks}")

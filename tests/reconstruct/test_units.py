@@ -5,15 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 from media import make_camera, make_scene, random_values
-from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.coefficients import Volume, mix_media
+from ddrecon.medium.coefficients import mix_media
 from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty import Uncertainty
 
@@ -38,7 +37,7 @@ MEDIA = {"media.cloud.density": SMOOTH, "media.air.sigma_s": ParameterSettings()
 SOUGHT = {"cameras": CAMERAS, "sections": SECTIONS, "media": MEDIA}
 
 
-def scene_of(kind: str) -> Scene:
+def scene_of(kind):
     """Two views of a ball from an empty box, to be reconstructed for what is `SOUGHT`."""
     z = torch.linspace(-1, 1, 6, dtype=torch.float64)
     density = (0.9 - z[:, None, None] ** 2 - z[:, None] ** 2 - z**2).clamp(min=0)
@@ -73,7 +72,7 @@ def scene_of(kind: str) -> Scene:
     return replace(world, starts=starts)
 
 
-def factor_of(name: str, density: float, length: float) -> float | Tensor:
+def factor_of(name, density, length):
     """By how much the variable `name` grows in units of density and length so much smaller."""
     if name.endswith(".camera"):
         return torch.tensor([1, 1, 1, length, length, length])
@@ -87,13 +86,13 @@ def factor_of(name: str, density: float, length: float) -> float | Tensor:
     return factors.get(name.rpartition(".")[2], 1.0)
 
 
-def in_units(scene: Scene, density: float, length: float) -> Scene:
+def in_units(scene, density, length):
     """`scene` whose densities and lengths are so many times as large, in units so much smaller."""
 
-    def scaled(name: str, value: Tensor) -> Tensor:
+    def scaled(name, value):
         return value * factor_of(name, density, length)
 
-    def volume_of(volume: Volume) -> Volume:
+    def volume_of(volume):
         if volume.media is not None:
             return mix_media({name: volume_of(medium) for name, medium in volume.media.items()})
         lower, upper = (
@@ -104,7 +103,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
         fields = {name: scaled(name, getattr(volume, name)) for name in names}
         return replace(volume, grid=Grid(volume.grid.shape, lower, upper), **fields)
 
-    def view_of(view: View) -> View:
+    def view_of(view):
         pose = view.camera.pose * view.camera.pose.new_tensor([1, 1, 1, length])
         return replace(view, camera=replace(view.camera, pose=pose))
 
@@ -120,7 +119,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
     )
 
 
-def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
+def found(kind, density=1.0, length=1.0):
     """What a run finds, and how far an experiment errs, in units of `scene_of`; its iterations."""
     torch.manual_seed(0)
     run = Reconstruction(in_units(scene_of(kind), density, length))
@@ -144,7 +143,7 @@ def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Ten
     ("kind", "density", "length"),
     [("cameras", 1e3, 1e-3), ("sections", 1 / 8, 1e3), ("media", 1e3, 1e-3)],
 )
-def test_a_run_is_the_same_in_every_unit(kind: str, density: float, length: float) -> None:
+def test_a_run_is_the_same_in_every_unit(kind, density, length):
     expected, actual = found(kind), found(kind, density, length)
     off = {name: float((actual[name] - value).norm()) for name, value in expected.items()}
     assert not {name for name, error in off.items() if error > 1e-4 * expected[name].norm()}

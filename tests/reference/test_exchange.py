@@ -4,7 +4,6 @@ import re
 import subprocess
 import sys
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +14,9 @@ from ddrecon.errors import DataWarning, FormatError, UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.exchange import export_scene, import_scene
 from ddrecon.reference.trace import open_tracer
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import cross_sections
 
@@ -30,12 +28,12 @@ SUN = DirectionalLight(-COLOR, COLOR)
 NEAR: list[Light] = [SUN, PointLight(COLOR, 2 * COLOR), AmbientLight(COLOR)]
 
 
-def sky(up: str) -> EnvironmentLight:
+def sky(up):
     radiance = COLOR.view(3, 1, 1) * torch.arange(18, dtype=torch.float64).view(1, 3, 6)
     return EnvironmentLight(radiance, 2 * COLOR[2], 205 * COLOR[2], up=up)
 
 
-def scene_of(lights: list[Light], **medium: torch.Tensor) -> Scene:
+def scene_of(lights, **medium):
     cameras = {
         name: make_camera(eye=(2.0, 0.5, 0.1), is_perspective=name == "front", half_width=0.6)
         for name in ("front", "plan")
@@ -45,13 +43,13 @@ def scene_of(lights: list[Light], **medium: torch.Tensor) -> Scene:
     return replace(make_scene(random_values(3, 4, 5), g=-0.4, **medium), lights=lights, views=views)
 
 
-def imported(scene: Scene, folder: Path) -> Scene:
+def imported(scene, folder):
     export_scene(scene, folder / "scene.xml", may_exist=False)
     import_scene(folder / "scene.xml", folder / "again.yaml", may_exist=False)
     return load_scene(folder / "again.yaml", dtype=torch.float64)
 
 
-def require_equal(first: object, second: object) -> None:
+def require_equal(first, second):
     """That two records of tensors and numbers hold the same, to single precision."""
     for field in fields(first):  # type: ignore[arg-type]
         a, b = (getattr(record, field.name) for record in (first, second))
@@ -62,7 +60,7 @@ def require_equal(first: object, second: object) -> None:
             assert a == b, field.name
 
 
-def coefficients(volume: Volume) -> torch.Tensor:
+def coefficients(volume):
     sigmas = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
     shape = (-1, 1, 1, 1) if sigmas[0].ndim == 1 else sigmas[0].shape
     return torch.stack([volume.density * sigma.view(shape) for sigma in sigmas])
@@ -72,7 +70,7 @@ def coefficients(volume: Volume) -> torch.Tensor:
     "lights",
     [[SUN, PointLight(COLOR, 2 * COLOR), sky("y")], [SUN, sky("z")], [AmbientLight(COLOR)]],
 )
-def test_lights_and_cameras_come_back(tmp_path: Path, lights: list[Light]) -> None:
+def test_lights_and_cameras_come_back(tmp_path, lights):
     if any(isinstance(light, EnvironmentLight) for light in lights):
         pytest.importorskip("OpenImageIO")
     gray = torch.tensor([1.0]), torch.tensor([4.0])
@@ -97,7 +95,7 @@ def test_lights_and_cameras_come_back(tmp_path: Path, lights: list[Light]) -> No
 
 @pytest.mark.parametrize("colors", [1, 3])
 @pytest.mark.parametrize("is_field", [False, True])
-def test_media_come_back(tmp_path: Path, colors: int, is_field: bool) -> None:
+def test_media_come_back(tmp_path, colors, is_field):
     albedo = torch.tensor([0.9, 0.8, 0.7], dtype=torch.float64)[:colors]
     sigma_t = torch.full((colors,), 5.0, dtype=torch.float64)
     if is_field:
@@ -133,7 +131,7 @@ def test_media_come_back(tmp_path: Path, colors: int, is_field: bool) -> None:
         ('<scene version="', '<scene version="x', "[^\\n]+version[^\\n]+$"),
     ],
 )
-def test_what_is_not_read_is_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_what_is_not_read_is_named(tmp_path, old, new, fault):
     path = tmp_path / "scene.xml"
     export_scene(make_scene(random_values(3, 4, 5)), path, may_exist=False)
     text = path.read_text()
@@ -144,7 +142,7 @@ def test_what_is_not_read_is_named(tmp_path: Path, old: str, new: str, fault: st
     assert not (tmp_path / "again.yaml").exists()
 
 
-def test_a_shape_without_a_medium_is_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_a_shape_without_a_medium_is_left_out_with_a_warning(tmp_path):
     path = tmp_path / "scene.xml"
     export_scene(make_scene(random_values(3, 4, 5)), path, may_exist=False)
     ball = '<shape type="sphere"/>\n</scene>'
@@ -165,7 +163,7 @@ np.save(path + ".npy", np.array(image, np.float64))
 """
 
 
-def opened(path: Path, paths: int, seed: int) -> np.ndarray:
+def opened(path, paths, seed):
     """The scene as a user's Mitsuba shows it by so many paths a pixel.
 
     In a process of its own, since after other scenes Mitsuba's EXR reader has hung.
@@ -178,7 +176,7 @@ def opened(path: Path, paths: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("with_sky", [False, True])
-def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
+def test_a_gray_scene_opened_is_the_scene_traced(tmp_path, with_sky):
     """Through a camera of either kind, by each light, over a ground with and without a map."""
     lights, reflected = NEAR, COLOR / 4
     if with_sky:
@@ -196,7 +194,7 @@ def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool)
     )
 
 
-def test_what_is_there_stays(tmp_path: Path) -> None:
+def test_what_is_there_stays(tmp_path):
     scene, path = make_scene(random_values(3, 4, 5)), tmp_path / "scene.xml"
     (tmp_path / "scene.sigma_t.vol").write_text("mine")
     with pytest.raises(UsageError, match=r"scene.sigma_t.vol: already there"):

@@ -2,13 +2,11 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from media import make_camera, make_scene, random_values
-from torch import Tensor
 
 from ddrecon.errors import SceneError
 from ddrecon.light.ground import Ground, Plane
@@ -23,27 +21,26 @@ from ddrecon.medium.phase import Blend, HenyeyGreenstein, Tabulated, TwoLobe
 from ddrecon.numerics.series import STEPS, even_angles
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.reference.trace import Traced, pick_color
-from ddrecon.scene import Scene
 
 SHAPE = (3, 4, 5)
 
 
-def described(scene: Scene) -> dict[str, Any]:
+def described(scene):
     return mitsuba_scene(scene, scene.views)
 
 
-def extinction(medium: dict[str, Any]) -> np.ndarray:
+def extinction(medium):
     return medium["scale"] * medium["sigma_t"]["grid"]
 
 
-def test_pixels_that_are_not_square_are_refused() -> None:
+def test_pixels_that_are_not_square_are_refused():
     camera = replace(make_camera(), pixel_aspect=1.1)
     with pytest.raises(SceneError, match=r"cameras are square, those of this one 1\.1 times as"):
         described(make_scene(random_values(*SHAPE), camera=camera))
 
 
 @pytest.mark.parametrize("absorbing", [(3, *SHAPE), (1, *SHAPE), (3, 1, 1, 1), (1, 1, 1, 1)])
-def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
+def test_cross_sections_per_cell(absorbing):
     sigma_a, scattering = random_values(*absorbing, seed=1), random_values(3, *SHAPE, seed=2)
     constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
     scene = make_scene(random_values(*SHAPE), sigma_a=constant, sigma_s=scattering)
@@ -54,7 +51,7 @@ def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
     np.testing.assert_allclose(found, (scattering * density).permute(1, 2, 3, 0), rtol=1e-5)
 
 
-def test_outside_of_a_support_nothing_is() -> None:
+def test_outside_of_a_support_nothing_is():
     scene, support = (
         make_scene(random_values(*SHAPE)),
         (random_values(*SHAPE, seed=1) > 0.5).double(),
@@ -65,7 +62,7 @@ def test_outside_of_a_support_nothing_is() -> None:
     np.testing.assert_array_equal(found, known)
 
 
-def test_nothing_scatters_where_nothing_is() -> None:
+def test_nothing_scatters_where_nothing_is():
     fields = dict.fromkeys(("sigma_a", "sigma_s"), torch.zeros(1, *SHAPE, dtype=torch.float64))
     everywhere = dict.fromkeys(("sigma_a", "sigma_s"), (0.0,))
     by_cell, by_number = (
@@ -75,7 +72,7 @@ def test_nothing_scatters_where_nothing_is() -> None:
     assert not by_cell["grid"].any() and by_number == 0
 
 
-def test_gray_is_told_through_rounding() -> None:
+def test_gray_is_told_through_rounding():
     density, albedo = random_values(*SHAPE), torch.tensor([0.95, 0.9, 0.8])
     scene = make_scene(density.float(), sigma_a=12 * (1 - albedo), sigma_s=12 * albedo)
     assert is_gray(scene.volume) and extinction(described(scene)["medium"]).shape == (*SHAPE, 1)
@@ -84,7 +81,7 @@ def test_gray_is_told_through_rounding() -> None:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("height", [-0.6, -2.0])
-def test_a_ground_is_a_wide_square_below_the_box(axis: int, height: float) -> None:
+def test_a_ground_is_a_wide_square_below_the_box(axis, height):
     """Its corners are where the plane is, or a little below the box, and it looks up."""
     scene = make_scene(random_values(*SHAPE))
     albedo = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
@@ -97,7 +94,7 @@ def test_a_ground_is_a_wide_square_below_the_box(axis: int, height: float) -> No
     assert np.linalg.det(turned[:3, :3]) > 0 and found["bsdf"]["reflectance"] == (0.1, 0.2, 0.3)
 
 
-def every_light(like: Tensor) -> list[Any]:
+def every_light(like):
     values = like.new_tensor
     color = values([1.0, 2.0, 3.0])
     sky = EnvironmentLight(color.view(3, 1, 1).expand(3, 2, 3), values(2.0), values(30.0))
@@ -105,7 +102,7 @@ def every_light(like: Tensor) -> list[Any]:
     return [*lights, sky, PointLight(color, color)]
 
 
-def test_one_color_of_a_scene_is_that_color() -> None:
+def test_one_color_of_a_scene_is_that_color():
     scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
     whole = described(scene)
     for color in range(3):
@@ -120,7 +117,7 @@ def test_one_color_of_a_scene_is_that_color() -> None:
         )
 
 
-def test_a_beam_is_refused_of_all_colors_and_of_one() -> None:
+def test_a_beam_is_refused_of_all_colors_and_of_one():
     beam = BeamLight(*random_values(3, 3).unbind(), random_values(1)[0])
     scene = replace(make_scene(random_values(*SHAPE)), lights=[*every_light(beam.power), beam])
     for one in (scene, *(pick_color(scene, color) for color in range(3))):
@@ -129,7 +126,7 @@ def test_a_beam_is_refused_of_all_colors_and_of_one() -> None:
             described(one)
 
 
-def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
+def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time():
     scene = make_scene(random_values(*SHAPE))
     weight = scene.volume.density.new_tensor([0.7, 0.5, 0.2])
     scene.volume.phase = TwoLobe(weight.new_tensor([0.6, -0.3]), weight)
@@ -152,7 +149,7 @@ def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
         np.testing.assert_array_equal(one["weight"]["grid"], phases[0]["weight"]["grid"])
 
 
-def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused() -> None:
+def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused():
     scene, weight = make_scene(random_values(*SHAPE)), random_values(*SHAPE, seed=1)
     scene.volume.phase = TwoLobe(weight.new_tensor([0.6, -0.3]), weight)
     phase = described(scene)["medium"]["phase"]
@@ -163,7 +160,7 @@ def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused()
         described(scene)
 
 
-def test_a_table_of_values_goes_from_backward_to_forward() -> None:
+def test_a_table_of_values_goes_from_backward_to_forward():
     scene = make_scene(random_values(*SHAPE))
     scene.volume.phase = Tabulated(2 + even_angles(STEPS).cos()[None])
     phase = described(scene)["medium"]["phase"]
@@ -173,20 +170,20 @@ def test_a_table_of_values_goes_from_backward_to_forward() -> None:
     np.testing.assert_allclose(values, expected, rtol=1e-6)
 
 
-def test_two_environment_maps_are_refused() -> None:
+def test_two_environment_maps_are_refused():
     lights = every_light(random_values(1))
     with pytest.raises(SceneError, match="2 environment maps"):
         described(replace(make_scene(random_values(*SHAPE)), lights=[*lights, *lights]))
 
 
-def test_a_camera_inside_the_volume_is_in_its_medium() -> None:
+def test_a_camera_inside_the_volume_is_in_its_medium():
     for depth, is_inside in ((0.2, True), (2.0, False)):
         camera = make_camera(eye=(0.1, 0.1, depth))
         sensor = described(make_scene(random_values(*SHAPE), camera=camera))["sensor_0"]
         assert ("medium" in sensor) == is_inside
 
 
-def test_rays_of_which_only_some_start_inside_are_refused() -> None:
+def test_rays_of_which_only_some_start_inside_are_refused():
     camera = make_camera(eye=(0.1, 0.1, 0.2), half_width=1.0, is_perspective=False)
     with pytest.raises(SceneError, match="view 'view'"):
         described(make_scene(random_values(*SHAPE), camera=camera))
@@ -197,22 +194,22 @@ SIGMA, PASSES = 0.5, 8
 
 
 @pytest.fixture
-def traced() -> Traced:
+def traced():
     random = np.random.default_rng(0)
     return Traced.of([TRUTH + SIGMA * random.normal(size=TRUTH.shape) for _ in range(PASSES)])
 
 
-def test_noise_is_that_of_the_mean(traced: Traced) -> None:
+def test_noise_is_that_of_the_mean(traced):
     assert traced.noise == pytest.approx(SIGMA / math.sqrt(PASSES * (TRUTH**2).mean()), rel=0.03)
 
 
-def test_an_error_is_told_through_noise(traced: Traced) -> None:
+def test_an_error_is_told_through_noise(traced):
     assert traced.distance(1.1 * TRUTH) > 0.1
     assert traced.error(1.1 * TRUTH) == pytest.approx(0.1, rel=0.05)
     assert traced.error(TRUTH) < 0.3 * traced.noise
     assert traced.error(traced.image) == 0
 
 
-def test_a_black_image() -> None:
+def test_a_black_image():
     black = Traced.of([np.zeros((2, 2, 3))] * 4)
     assert (black.noise, black.error(np.zeros((2, 2, 3)))) == (0, 0)

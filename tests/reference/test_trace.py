@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from media import make_camera, make_scene, random_values
-from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
@@ -18,7 +17,6 @@ from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, Rayleig
 from ddrecon.picture import render
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
 pytestmark = pytest.mark.slow
@@ -33,14 +31,12 @@ COLORS = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 SIDES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def passes(scene: Scene, count: int, samples: int, depth: int = -1) -> list[np.ndarray]:
+def passes(scene, count, samples, depth=-1):
     tracer = open_tracer(scene, scene.views, depth)
     return [tracer.trace(0, seed, samples) for seed in range(count)]
 
 
-def seen_from(
-    side: tuple[float, float, float], half_width: float, size: int, is_perspective: bool = False
-) -> Camera:
+def seen_from(side, half_width, size, is_perspective=False):
     towards = CENTER.new_tensor(side)
     up = towards.roll(1) if 1.0 in side else CENTER.new_tensor((0.0, 1.0, 0.0))
     pose = look_at(CENTER + 2 * towards, CENTER, up)
@@ -51,7 +47,7 @@ BLACK = {"sigma_s": (0.0,), "directional": None}
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str) -> None:
+def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side):
     density, sigma = torch.full((2, 3, 2), 1.5, dtype=torch.float64), np.array([0.5, 1.0, 2.0])
     grid = Grid.from_xyz((2, 3, 2), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.2, 4)
@@ -67,7 +63,7 @@ def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str
 @pytest.mark.parametrize(
     ("side", "corner"), [("x", (0, 0, 0)), ("y", (2, 0, 4)), ("z", (2, 3, 0)), ("x", (2, 3, 0))]
 )
-def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int]) -> None:
+def test_a_voxel_darkens_the_place_it_has(side, corner):
     density = torch.zeros(3, 4, 5, dtype=torch.float64)
     density[corner] = 8.0
     grid = Grid.from_xyz((5, 4, 3), LOWER, UPPER)
@@ -82,7 +78,7 @@ def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int
     np.testing.assert_allclose(place, (right, up), atol=0.3 * min(grid.spacing))
 
 
-def soft_ball(cells: int) -> tuple[Grid, Tensor]:
+def soft_ball(cells):
     """A ball that is denser towards +x, on cells that are no cubes."""
     grid = Grid.from_xyz((cells, cells, cells), LOWER, UPPER)
     z, y, x = grid.centers(CENTER)
@@ -90,7 +86,7 @@ def soft_ball(cells: int) -> tuple[Grid, Tensor]:
     return grid, torch.sigmoid((0.28 - radius) / 0.05) * (1 + x)
 
 
-def sky() -> Tensor:
+def sky():
     """A map [3, 8, 16] without symmetry, one pixel of it bright."""
     down = torch.linspace(1, 0.1, 8, dtype=torch.float64)
     radiance = (COLORS.view(3, 1, 1) * down.view(8, 1)).repeat(1, 1, 16)
@@ -112,7 +108,7 @@ LIGHTS: dict[str, Callable[[], list[Light]]] = {
 
 
 @pytest.mark.parametrize("light", LIGHTS)
-def test_light_scattered_once_is_ours_to_4_percent(light: str) -> None:
+def test_light_scattered_once_is_ours_to_4_percent(light):
     grid, density = soft_ball(12)
     is_perspective = light not in ("directional", "environment")
     half_width = 0.25 if is_perspective else 0.5
@@ -140,7 +136,7 @@ PHASES: dict[str, PhaseFunction] = {
 
 
 @pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES.keys())
-def test_every_phase_function_is_theirs(phase: PhaseFunction) -> None:
+def test_every_phase_function_is_theirs(phase):
     """As `blendphase`, `rayleigh` and `tabphase`, and color by color."""
     grid, density = soft_ball(12)
     camera = seen_from((0.5, 0.3, 0.8), 0.2, 8, True)
@@ -155,7 +151,7 @@ def test_every_phase_function_is_theirs(phase: PhaseFunction) -> None:
     np.testing.assert_allclose(ours.mean((0, 1)), traced.image.mean((0, 1)), rtol=0.02)
 
 
-def test_the_background_is_seen_where_we_see_it() -> None:
+def test_the_background_is_seen_where_we_see_it():
     grid, density = soft_ball(8)
     camera = seen_from((0.5, 0.3, 0.8), 1.2, 16, True)
     scene = make_scene(density, grid=grid, sigma_a=(20.0,), camera=camera, model="none", **BLACK)
@@ -166,7 +162,7 @@ def test_the_background_is_seen_where_we_see_it() -> None:
 
 
 @pytest.mark.parametrize("axis", [1, 2])
-def test_a_map_on_the_ground_is_seen_where_we_see_it(axis: int) -> None:
+def test_a_map_on_the_ground_is_seen_where_we_see_it(axis):
     """Turned or mirrored it is another picture."""
     side = torch.eye(3, dtype=torch.float64)[2 - axis]
     camera = seen_from(tuple((side + 0.2 * side.roll(1)).tolist()), 0.5, 16)
@@ -178,19 +174,19 @@ def test_a_map_on_the_ground_is_seen_where_we_see_it(axis: int) -> None:
     assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.05
 
 
-def test_seeds() -> None:
+def test_seeds():
     scene = make_scene(random_values(3, 4, 5))
     first, second = passes(scene, 2, 4)
     assert np.array_equal(first, passes(scene, 1, 4)[0]) and not np.array_equal(first, second)
 
 
-def test_nothing_and_nothing_that_shines() -> None:
+def test_nothing_and_nothing_that_shines():
     empty = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), ambient=(0.5,))
     np.testing.assert_allclose(passes(empty, 1, 4)[0], 0.5, rtol=1e-6)
     assert not passes(replace(empty, lights=[]), 1, 4)[0].any()
 
 
-def test_an_off_center_camera_is_theirs() -> None:
+def test_an_off_center_camera_is_theirs():
     """Mitsuba's own rays through the corners of the film are ours."""
     mitsuba = load_mitsuba()
     camera = replace(make_camera(size=(4, 6), half_width=0.4), principal_point=(0.3, 0.65))

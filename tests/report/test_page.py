@@ -12,7 +12,6 @@ import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from ddrecon.light.lights import PointLight
 from ddrecon.pictures import encode, encode_bytes
 from ddrecon.reconstruct.frame import Row
 from ddrecon.report import volumes
-from ddrecon.report.page import Plot, draw_curve, page_text, write_page
+from ddrecon.report.page import draw_curve, page_text, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import (
     FARTHEST,
@@ -46,27 +45,27 @@ WORLD = describe_world(Grid((1, 1, 1), (0.0,) * 3, (1.0,) * 3), None)
 class Balance(HTMLParser):
     """Notes tags that are not closed in turn, and all text."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.open: list[str] = []
         self.text: list[str] = []
 
-    def handle_starttag(self, tag: str, attrs: object) -> None:
+    def handle_starttag(self, tag, attrs):
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: object) -> None:
+    def handle_startendtag(self, tag, attrs):
         """Those are closed."""
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.text.append(data)
 
 
 @pytest.fixture
-def facts() -> dict[str, Any]:
+def facts():
     """A page of every section, whose texts are `NASTY`."""
     shown = Shown(NASTY, "result", torch.ones(1, 1, 1))
     plots = [draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
@@ -87,7 +86,7 @@ def facts() -> dict[str, Any]:
     }
 
 
-def test_a_page_is_whole_and_escapes_what_it_is_told(facts: dict[str, Any]) -> None:
+def test_a_page_is_whole_and_escapes_what_it_is_told(facts):
     for name in facts.keys() - {"goes_on"}:
         reader, text = Balance(), page_text(**{"title": "", "lead": "", name: facts[name]})
         reader.feed(text)
@@ -97,7 +96,7 @@ def test_a_page_is_whole_and_escapes_what_it_is_told(facts: dict[str, Any]) -> N
     assert reader.open == []
 
 
-def test_a_page_names_no_other_file(tmp_path: Path, facts: dict[str, Any]) -> None:
+def test_a_page_names_no_other_file(tmp_path, facts):
     write_page(tmp_path / "report.html", **facts)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     addresses = re.findall(r'(?:src|href|url)[=(]"([^"]*)"', text)
@@ -107,12 +106,12 @@ def test_a_page_names_no_other_file(tmp_path: Path, facts: dict[str, Any]) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def places(plot: Plot) -> list[list[tuple[float, float]]]:
+def places(plot):
     """The points of every line."""
     return [points for _, points in plot.curves]
 
 
-def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
+def test_a_straight_line_stays_straight_and_a_power_becomes_one():
     linear = places(draw_curve("a", {"": [(float(x), 3 * x - 1.0) for x in range(9)]}, "x"))
     powers = [(float(x), 10.0**-x) for x in range(9)]
     power = places(draw_curve("a", {"": powers}, "x", is_logarithmic=True))
@@ -121,7 +120,7 @@ def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
         assert slopes == pytest.approx([slopes[0]] * 8, abs=0.01) and slopes[0] * sign > 0
 
 
-def test_what_cannot_be_drawn_is_left_out() -> None:
+def test_what_cannot_be_drawn_is_left_out():
     points = [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]
     (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
@@ -131,7 +130,7 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
     assert not draw_curve("a", {"": [(0.0, math.nan)]}, "x").curves
 
 
-def test_each_curve_of_a_run_is_what_its_name_says() -> None:
+def test_each_curve_of_a_run_is_what_its_name_says():
     """Of each the slope, in a plot's own unit, by the color of its name."""
     rows = [
         Row(i, 0.0, 9.0, 3.0 * i, 2.0 * i, 0, 0, 8, data_loss=10.0 ** (-i), penalty=10.0 ** (i / 4))
@@ -145,7 +144,7 @@ def test_each_curve_of_a_run_is_what_its_name_says() -> None:
         assert slopes[names[one]] / slopes[names[other]] == pytest.approx(ratio, rel=0.01)
 
 
-def embedded(*fields: Shown) -> list[dict]:
+def embedded(*fields):
     """The fields in a page, decoded as its scripts do: [z, y, x, channels]."""
     contents = describe_volume(fields, WORLD)["fields"]
     for content in contents:
@@ -156,7 +155,7 @@ def embedded(*fields: Shown) -> list[dict]:
 
 
 @pytest.mark.parametrize("colors", [(), (3,)])
-def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None:
+def test_a_field_is_embedded_as_it_is_displayed(colors):
     """x fastest, in 8 bits of sRGB, at most half a step of it off; above white it is white.
 
     A field beside it of the same name, and half as large, has the same scale.
@@ -173,7 +172,7 @@ def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None
     assert np.abs(found["cells"] - expected).max() <= 0.501
 
 
-def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_field_is_embedded_coarser(monkeypatch):
     """By means of blocks, those at the far ends of what is left over."""
     monkeypatch.setattr(volumes, "MOST_CELLS", 20)
     values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
@@ -183,7 +182,7 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
 
 
-def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
+def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides():
     """Blue below, red above, as strong as far from zero: in pages and in pictures alike."""
     values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
     (found,) = embedded(Shown("g", "result", values))
@@ -196,7 +195,7 @@ def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
         np.testing.assert_allclose(light_red, (red + white) / 2, atol=1)
 
 
-def test_what_is_drawn_has_a_name_and_a_role() -> None:
+def test_what_is_drawn_has_a_name_and_a_role():
     page = page_text(volume=describe_volume([], WORLD))
     canvases = re.findall("<canvas[^>]*>", page)
     assert len(canvases) == 6
@@ -204,7 +203,7 @@ def test_what_is_drawn_has_a_name_and_a_role() -> None:
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_cameras_and_lights_stand_where_the_scene_has_them(is_perspective: bool) -> None:
+def test_cameras_and_lights_stand_where_the_scene_has_them(is_perspective):
     """In boxes from the middle; corners are seen in the middles of the image's corner pixels."""
     grid = Grid((4, 6, 2), (1.0, 2.0, 3.0), (2.0, 5.0, 4.0))
     camera = make_camera((9.0, 5.0, 20.0), (5, 8), is_perspective=is_perspective)
@@ -233,7 +232,7 @@ console.log(JSON.stringify(JSON.parse(fs.readFileSync(0, "utf8")).map(read)));
 """
 
 
-def test_pages_read_out_what_a_cell_holds() -> None:
+def test_pages_read_out_what_a_cell_holds():
     """Within half a step of the eight bits that they have, of signed fields as well."""
     row, signed = torch.linspace(0, 2, 9), torch.linspace(-0.6, 0.6, 9)
     fields = [
@@ -269,7 +268,7 @@ console.log(JSON.stringify(drawn));
 """
 
 
-def test_a_box_is_drawn_where_an_eye_sees_its_corners() -> None:
+def test_a_box_is_drawn_where_an_eye_sees_its_corners():
     """A cube of two units, from two boxes away: its far half behind the smoke, the near before."""
     told = run_script("stage.js", STAGE)
     for points, depth in zip(told, (2.5, 1.5), strict=True):
@@ -279,7 +278,7 @@ def test_a_box_is_drawn_where_an_eye_sees_its_corners() -> None:
         assert {tuple(np.round(corner, 6)) for corner in corners} <= seen
 
 
-def run_script(name: str, code: str, told: object = None) -> Any:
+def run_script(name, code, told=None):
     """What `code` prints as JSON, given the path of the script `name` and what it is `told`."""
     if (node := shutil.which("node")) is None:
         pytest.skip("no node here to run the scripts of a page")
@@ -289,13 +288,13 @@ def run_script(name: str, code: str, told: object = None) -> Any:
     return json.loads(done.stdout)
 
 
-def framed(text: str) -> str:
+def framed(text):
     """The page within the frame of `text`."""
     (page,) = re.findall(r'<iframe sandbox="allow-scripts" srcdoc="([^"]*)"', text)
     return html.unescape(page)
 
 
-def test_a_notebook_shows_the_fields_of_a_scene_and_of_a_volume() -> None:
+def test_a_notebook_shows_the_fields_of_a_scene_and_of_a_volume():
     scene = make_scene(random_values(3, 4, 5, dtype=torch.float32).requires_grad_())
     scene.volume.sigma_s = torch.rand(3, 3, 4, 5)
     for shown in (scene, scene.volume):

@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from ddrecon.run.quality import (
     register,
     shift_between,
 )
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
 
@@ -44,7 +43,7 @@ SMALL = (
 )
 
 
-def make_scene(*overrides: str) -> Scene:
+def make_scene(*overrides):
     """The ball's views, small, of a lopsided blob with noise; the density starts near the truth."""
     scene = load_scene(BALL, overrides=(*SMALL, *overrides))
     z, y, x = scene.volume.grid.centers(scene.volume.density)
@@ -58,12 +57,12 @@ def make_scene(*overrides: str) -> Scene:
     return replace(scene, views=views, volume=truth.volume, starts=starts)
 
 
-def kinds(scene: Scene, iterations: int = 60) -> list[str]:
+def kinds(scene, iterations=60):
     """The kinds of diagnoses of a reconstruction of `scene`."""
     return kinds_at(scene, iterations)[-1]
 
 
-def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
+def kinds_at(scene, *stops):
     """The same of one that is looked at after so many iterations, and ends after the last."""
     run, told = Reconstruction(scene, stops[-1]), []
     while not run.is_done:
@@ -75,22 +74,22 @@ def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
     return told
 
 
-def expose(scene: Scene) -> None:
+def expose(scene):
     scene.views[2].image = scene.views[2].image * 1.6
 
 
-def move(scene: Scene) -> None:
+def move(scene):
     change = torch.tensor([0.0, 0, 0, 0.12, 0, 0])
     camera = scene.views[3].camera
     scene.views[3].camera = twist(camera, change, scene.volume.grid.center_xyz)
 
 
-def keep_one(scene: Scene) -> None:
+def keep_one(scene):
     scene.views[1:-1] = []
     start_empty(scene)
 
 
-def start_empty(scene: Scene) -> None:
+def start_empty(scene):
     scene.starts["density"] = torch.zeros(scene.volume.grid.shape)
 
 
@@ -99,14 +98,14 @@ FAULTS |= {"overfit": (keep_one, 50), "unfinished": (start_empty, 5), "empty": (
 
 
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_is_told_and_no_other(kind: str) -> None:
+def test_a_fault_is_told_and_no_other(kind):
     fault, iterations = FAULTS[kind]
     scene = make_scene()
     fault(scene)
     assert kinds(scene, iterations) == [kind] * (kind != "clean")
 
 
-def findings_of(scene: Scene) -> Findings:
+def findings_of(scene):
     """What each view of `scene` shows, all equally well."""
     with torch.no_grad():
         images = {view.name: render(scene, view.name)[0] for view in scene.views}
@@ -120,7 +119,7 @@ AT_REST = 60, 0.0
 @pytest.mark.parametrize(
     ("gain", "advice"), [(math.inf, "--resume"), (0.0, "directions of lights")]
 )
-def test_why_a_volume_is_empty_is_told(gain: float, advice: str) -> None:
+def test_why_a_volume_is_empty_is_told(gain, advice):
     """Nothing else is: what is not there is neither overfit nor seen from a wrong side."""
     scene = make_scene()
     views = [replace(view, is_test=view.name == "ring_01") for view in scene.views]
@@ -133,15 +132,13 @@ def test_why_a_volume_is_empty_is_told(gain: float, advice: str) -> None:
 
 
 @pytest.mark.parametrize(("misfit", "kinds"), [(3.0, []), (5.0, ["unexplained"])])
-def test_pictures_that_a_run_at_rest_does_not_explain_are_told(
-    misfit: float, kinds: list[str]
-) -> None:
+def test_pictures_that_a_run_at_rest_does_not_explain_are_told(misfit, kinds):
     diagnoses = diagnose(findings_of(make_scene()), *AT_REST, misfit=misfit)
     assert [diagnosis["kind"] for diagnosis in diagnoses] == kinds
 
 
 @pytest.mark.parametrize("rows", [0, 4])
-def test_what_a_support_cuts_off_is_told_with_the_view_that_does(rows: int) -> None:
+def test_what_a_support_cuts_off_is_told_with_the_view_that_does(rows):
     """One of seven cameras is off by some rows, so that it shows nothing where the others do."""
     scene = make_scene()
     shown = [view.image.amax(0) > 0.3 * view.image.max() for view in scene.views]
@@ -154,7 +151,7 @@ def test_what_a_support_cuts_off_is_told_with_the_view_that_does(rows: int) -> N
     assert all(f"check camera {scene.views[3].name}, which alone" in text for text in texts)
 
 
-def test_a_camera_is_told_though_a_volume_fitted_to_all_hides_most_of_it() -> None:
+def test_a_camera_is_told_though_a_volume_fitted_to_all_hides_most_of_it():
     """A render that is moved would fit a decibel better, by a quarter of what it leaves."""
     scene = make_scene("volume.resolution=[16, 16, 16]")
     images = findings_of(scene).images
@@ -180,9 +177,7 @@ SIDE = (
 @pytest.mark.parametrize(
     ("begin", "scene"), [(lambda scene: None, ()), (start_empty, SIDE)], ids=["near", "far"]
 )
-def test_nobody_is_accused_of_what_going_on_would_mend(
-    begin: Callable[[Scene], None], scene: tuple[str, ...]
-) -> None:
+def test_nobody_is_accused_of_what_going_on_would_mend(begin, scene):
     """On correct scenes, at any time; a picture exposed otherwise is told at the end."""
     right, wrong = make_scene(*scene), make_scene(*scene)
     wrong.views[2].image = 1.5 * wrong.views[2].image
@@ -193,19 +188,19 @@ def test_nobody_is_accused_of_what_going_on_would_mend(
     assert kinds(wrong, 40) == ["exposure"]
 
 
-def blob(right: float = 0.0, down: float = 0.0) -> torch.Tensor:
+def blob(right=0.0, down=0.0):
     """A smooth picture, moved by so many pixels."""
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(50.0), indexing="ij")
     return torch.exp(-((x - 24 - right) ** 2 + (y - 19 - down) ** 2) / 60).expand(3, -1, -1)
 
 
-def views_of(**images: torch.Tensor) -> list[View]:
+def views_of(**images):
     mask = (torch.arange(50) > 5).float().expand(40, 50)
     return [View(name, None, image=x, mask=mask) for name, x in images.items()]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("move", [(0.3, -0.2), (-0.15, 0.25)])
-def test_the_shift_of_a_smooth_picture_is_found(move: tuple[float, float]) -> None:
+def test_the_shift_of_a_smooth_picture_is_found(move):
     """To first order: a picture and its copy a part of a pixel to the right and down."""
     (view,) = views_of(front=blob(*move))
     found, explained = best_shift(view, blob())
@@ -227,9 +222,7 @@ MOVES = {"a": 0.4, "b": 0.6, "c": 1.3, "d": -1.0, "e": 0.8, "f": -1.1}
         (views_of(a=blob(0.4), b=blob(0.3, 0.3)), ""),
     ],
 )
-def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
-    views: Sequence[View], told: str
-) -> None:
+def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(views, told):
     images = {view.name: blob() for view in views}
     texts = " ".join(find_odd(views, images, 0.0).values())
     found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", texts))
@@ -237,7 +230,7 @@ def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
 
 
 @pytest.mark.parametrize("loss", ["l2", "display"])
-def test_a_camera_that_is_off_is_found(loss: str) -> None:
+def test_a_camera_that_is_off_is_found(loss):
     camera = make_camera(size=(40, 40), half_width=0.28)
     density = torch.nn.functional.avg_pool3d(random_values(1, 16, 16, 16), 5, 2)[0]
     scene = plain_scene(density, camera=camera, sigma_a=(2.0,), sigma_s=(3.0,))
@@ -256,7 +249,7 @@ def test_a_camera_that_is_off_is_found(loss: str) -> None:
     assert true > 0.5 and abs(found["shift"] - true) < 0.15 * true
 
 
-def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell() -> None:
+def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell():
     """Of two puffs, as much as each extinguishes; a box twice as wide around them changes none."""
     camera = make_camera(size=(40, 40), half_width=0.6)
     moved = twist(camera, torch.tensor([0.02, -0.03, 0.01, 0.015, -0.02, 0.02]).double(), (0, 0, 0))
@@ -281,7 +274,7 @@ def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell() -> None:
 @pytest.mark.parametrize(
     ("gain", "much"), [(0.7, "half"), (0.2, "some 20 %"), (0.05, ""), (math.inf, "")]
 )
-def test_a_run_is_unfinished_where_a_tenth_is_to_go(gain: float, much: str) -> None:
+def test_a_run_is_unfinished_where_a_tenth_is_to_go(gain, much):
     """As the search has it, where it is not too short to tell."""
     told = find_unfinished(gain, 100)
     assert (told is not None) == bool(much)

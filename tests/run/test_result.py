@@ -1,14 +1,9 @@
 """The result of a run is a scene file that renders as what was found does."""
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from small_scene import write_scene
-from torch import Tensor
 
 from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import write_field
@@ -38,16 +33,14 @@ VARIED = [
 ]
 
 
-def moved(value: Tensor) -> Tensor:
+def moved(value):
     """`value` a little larger, everywhere by another amount."""
     generator = torch.Generator().manual_seed(0)
     random = torch.rand(value.shape, generator=generator, dtype=value.dtype)
     return value * (1.1 + 0.1 * random) + 0.01
 
 
-def finished(
-    folder: Path, medium: str, parameters: str, phase: str = "g: 0.3", start: Sequence[str] = ()
-) -> Any:
+def finished(folder, medium, parameters, phase="g: 0.3", start=()):
     """The scene found by a run in `folder`/out that ended, all its parameters moved."""
     path, random = write_scene(folder), np.random.default_rng(0)
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
@@ -74,9 +67,7 @@ def finished(
 @pytest.mark.parametrize(
     ("number", "parameters", "fields"), [(i, *varied) for i, varied in enumerate(VARIED)]
 )
-def test_a_result_renders_as_what_was_found(
-    tmp_path: Path, number: int, parameters: str, fields: Sequence[str]
-) -> None:
+def test_a_result_renders_as_what_was_found(tmp_path, number, parameters, fields):
     # Both ways to give cross sections, by turns.
     found = finished(tmp_path, MEDIA[number % 2], parameters)
     # Wherever its folder lies.
@@ -96,9 +87,7 @@ PHASES = {"{type: henyey_greenstein, g: 0.3}": "g: {}", LOBES: "phase.g: {}, pha
 
 
 @pytest.mark.parametrize(("phase", "parameters"), PHASES.items())
-def test_a_result_has_the_phase_function_that_was_found(
-    tmp_path: Path, phase: str, parameters: str
-) -> None:
+def test_a_result_has_the_phase_function_that_was_found(tmp_path, phase, parameters):
     found = finished(tmp_path, MEDIA[0], parameters, f"phase: {phase}").volume.phase
     again = load_scene(tmp_path / "out" / RESULT).volume.phase
     assert type(again) is type(found)
@@ -106,7 +95,7 @@ def test_a_result_has_the_phase_function_that_was_found(
         torch.testing.assert_close(one, other.detach(), rtol=1e-6, atol=0)
 
 
-def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
+def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path):
     box = np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]])
     write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), box)
     start = ["volume.bounds=~", "volume.resolution=~"]

@@ -1,9 +1,5 @@
 """Scenes as tensors: their settings, lights, colors and starts."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -16,15 +12,12 @@ from ddrecon.io.volumes.table import write_field, write_fields
 from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
 from ddrecon.lighting import solve_light
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 from ddrecon.variables.values import value_of, with_values
 
-Load = Callable[..., Scene]
 
-
-def test_constants(load: Load):
+def test_constants(load):
     scene = load(SCENE)
     medium, camera = scene.volume, scene.views[0].camera
     assert medium.grid.shape == SHAPE
@@ -45,7 +38,7 @@ CHOSEN += [(0.8, 50, True, (5, 5, 9)), (-0.8, 3, False, (4, 5, 3))]
 
 @pytest.mark.parametrize("g, depth, is_flat, expected", CHOSEN, ids=str)
 def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
-    tmp_path: Path, load: Load, g: float, depth: float, is_flat: bool, expected: tuple[int, ...]
+    tmp_path, load, g, depth, is_flat, expected
 ):
     """Cells are `depth` optical depths thick; all of them, or one that no face of the box has."""
     values = np.full((5, 5, 5), depth, np.float32)
@@ -71,9 +64,7 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
     assert fixed.diffusion.times == 1 and "refine" not in fixed.reason
 
 
-def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(
-    load: Load, monkeypatch: pytest.MonkeyPatch
-):
+def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(load, monkeypatch):
     monkeypatch.setattr(defaults, "MOST_CELLS", 300)
     bounds = {"min": [0, 0, 0], "max": [9, 1, 9]}
     scene = load(volume(bounds=bounds, resolution=[9, 3, 3], density=50))
@@ -83,9 +74,7 @@ def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(
 # Lights
 
 
-def test_lights_are_built_and_written_back(
-    read: Callable[[str], SceneFile], tmp_path: Path
-) -> None:
+def test_lights_are_built_and_written_back(read, tmp_path):
     pixels = np.random.default_rng(0).random((4, 6, 3)).astype(np.float32)
     pixels[1, 2, 0] = pixels[2, 5, 2] = -1e-3
     np.save(tmp_path / "sky.npy", pixels)
@@ -123,7 +112,7 @@ COLORS = {
 }
 
 
-def colored_text(folder: Path, **more: Any) -> str:
+def colored_text(folder, **more):
     """A scene whose colors are all three times those of `COLORS`, as in a gray sky."""
     pixels = np.random.default_rng(0).random((4, 8, 1)).astype(np.float32)
     np.save(folder / "sky.npy", pixels.repeat(3, 2))
@@ -141,7 +130,7 @@ def colored_text(folder: Path, **more: Any) -> str:
     return changed(volume=medium | sections | {"phase": phase}, lights=lights, views=views, **more)
 
 
-def test_equal_colors_are_one_channel_and_give_the_same_image(load: Load, tmp_path: Path):
+def test_equal_colors_are_one_channel_and_give_the_same_image(load, tmp_path):
     scene = load(colored_text(tmp_path))
     gray = {name: value_of(scene, name) for name in (*COLORS, "lights.3.radiance")}
     light = solve_light(scene, SolveMemory())
@@ -153,7 +142,7 @@ def test_equal_colors_are_one_channel_and_give_the_same_image(load: Load, tmp_pa
 
 
 @pytest.mark.parametrize("name", [*COLORS, "sigma_t", "lights.3.radiance"])
-def test_what_is_optimized_by_color_keeps_its_three(load: Load, tmp_path: Path, name: str):
+def test_what_is_optimized_by_color_keeps_its_three(load, tmp_path, name):
     scene = load(colored_text(tmp_path, optimize={"parameters": {name: {}}}))
     assert value_of(scene, name).shape[0] == 3
     other = "lights.0.irradiance" if name != "lights.0.irradiance" else "lights.1.radiance"
@@ -184,7 +173,7 @@ COLORED = torch.tensor([1.0, 2, 3]).view(3, 1, 1, 1).expand(3, *SHAPE)
         ("views.front.camera", "{}", [0] * 6),
     ],
 )
-def test_a_start(load: Load, name: str, settings: str, expected: Any) -> None:
+def test_a_start(load, name, settings, expected):
     starts = load(f"{SCENE}optimize: {{parameters: {{{name}: {settings}}}}}\n").starts
     assert list(starts) == [name]
     expected = torch.as_tensor(expected, dtype=torch.float64)
@@ -194,7 +183,7 @@ def test_a_start(load: Load, name: str, settings: str, expected: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "colors"), [("density", None), ("sigma_a", None), ("sigma_a", 3), ("albedo", 3)]
 )
-def test_a_start_from_a_file(load: Load, tmp_path: Path, name: str, colors: int | None) -> None:
+def test_a_start_from_a_file(load, tmp_path, name, colors):
     shape = (*SHAPE, colors) if colors else SHAPE
     values = np.random.default_rng(0).random(shape).astype(np.float32)
     write_field(tmp_path / "start.npz", name, values, BOUNDS)
@@ -204,7 +193,7 @@ def test_a_start_from_a_file(load: Load, tmp_path: Path, name: str, colors: int 
     assert torch.equal(load(f"{SCENE}optimize: {start}\n").starts[name], expected)
 
 
-def test_a_field_may_have_another_name_in_its_file(load: Load, tmp_path: Path):
+def test_a_field_may_have_another_name_in_its_file(load, tmp_path):
     """In the volume and where a parameter starts."""
     lwc, ice = np.random.default_rng(0).random((2, *SHAPE)).astype(np.float32)
     write_fields(tmp_path / "les.npz", {"lwc": lwc, "ice": ice}, BOUNDS)

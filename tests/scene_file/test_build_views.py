@@ -1,10 +1,7 @@
 """The views section: cameras, pictures and frames; whether cameras see the box, and why not."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,28 +10,22 @@ from example_scene import SCENE, VIEW, changed
 from film_files import H264, write_film
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.march.samplers import cross_box
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.build_views import explain_blindness, require_frames, sees_box
-from ddrecon.scene_file.load import SceneFile
-
-Load = Callable[..., Scene]
-Write = Callable[[str], Path]
 
 
-def problems(path: Path, *overrides: str) -> list[str]:
+def problems(path, *overrides):
     with pytest.raises(SceneError) as caught:
         load_scene(path, overrides=overrides)
     return [line.replace(f"{path.parent}/", "") for line in caught.value.problems]
 
 
-def test_an_absent_file_is_the_scenes_mistake(write: Write):
+def test_an_absent_file_is_the_scenes_mistake(write):
     path = write(
         SCENE.replace("{constant: 0.1}", "{file: none.npz}")
         + "optimize: {parameters: {density: {init: {file: no.npz}}}}\n"
@@ -47,7 +38,7 @@ def test_an_absent_file_is_the_scenes_mistake(write: Write):
     ]
 
 
-def test_images_become_channels_first_and_give_the_resolution(load: Load, tmp_path: Path):
+def test_images_become_channels_first_and_give_the_resolution(load, tmp_path):
     pixels = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
     np.save(tmp_path / "a.npy", pixels)
     np.save(tmp_path / "m.npy", np.eye(6, 8))
@@ -59,7 +50,7 @@ def test_images_become_channels_first_and_give_the_resolution(load: Load, tmp_pa
     assert view.camera.size == (6, 8) and view.is_test and view.name == "front"
 
 
-def test_cameras(load: Load):
+def test_cameras(load):
     matrix = [[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
     flat = {"type": "orthographic", "width": 3, "pixel_aspect": 1.25, "resolution": [8, 6]}
     views = load(changed(views=[VIEW, {"camera": flat | {"matrix": matrix}}])).views
@@ -71,7 +62,7 @@ def test_cameras(load: Load):
     assert orthographic.pose.tolist() == matrix[:3] and orthographic.pixel_aspect == 1.25
 
 
-def test_cameras_that_all_miss_the_volume_are_one_problem(write: Write):
+def test_cameras_that_all_miss_the_volume_are_one_problem(write):
     ring = {"count": 3, "radius": 3, "fov": 20, "target": [9, 0, 0], "resolution": [4, 4]}
     (line,) = problems(write(changed(views={"ring": ring})))
     assert line.startswith("scene.yaml:")
@@ -87,7 +78,7 @@ UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 @given(origin=POINT, direction=POINT)
-def test_marching_along_the_ray_agrees(origin: tuple[float, ...], direction: tuple[float, ...]):
+def test_marching_along_the_ray_agrees(origin, direction):
     length = torch.tensor(direction).norm()
     if length > 0.1:
         unit = torch.tensor(direction) / length
@@ -108,21 +99,21 @@ def test_marching_along_the_ray_agrees(origin: tuple[float, ...], direction: tup
         ([-0.12, 0.0, 0.0], (1, 2001), True),  # in one pixel of many
     ],
 )
-def test_a_camera_sees_the_box(target: list[float], size: tuple[int, int], expected: bool) -> None:
+def test_a_camera_sees_the_box(target, size, expected):
     eye = torch.tensor([0.0, 0.0, 200.0 if size[1] > 100 else 20.0])
     pose = look_at(eye, torch.tensor(target), torch.tensor([0.0, 1.0, 0.0]))
     assert sees_box(Camera(pose, size, 0.1), GRID) is expected
 
 
-def inverse(pose: Tensor) -> Tensor:
+def inverse(pose):
     return torch.linalg.inv(torch.cat([pose, pose.new_tensor([[0, 0, 0, 1]])]))[:3]
 
 
-def as_opencv(pose: Tensor) -> Tensor:
+def as_opencv(pose):
     return pose * torch.tensor([1.0, -1, -1, 1])
 
 
-def turned(sign: int) -> Callable[[Tensor], Tensor]:
+def turned(sign):
     """The world turned about x, after the box is moved to where that shows."""
     turn = torch.tensor([[1.0, 0, 0], [0, 0, -sign], [0, sign, 0]], dtype=torch.float64)
     return lambda pose: turn @ pose
@@ -140,9 +131,7 @@ def turned(sign: int) -> Callable[[Tensor], Tensor]:
         (lambda pose: pose + 90 * torch.eye(3, 4)[:, [3, 3, 3, 0]], "the camera looks past it"),
     ],
 )
-def test_the_mistake_is_named_that_blinds_all_cameras(
-    mistake: Callable[[Tensor], Tensor], words: str
-) -> None:
+def test_the_mistake_is_named_that_blinds_all_cameras(mistake, words):
     grid = Grid.from_xyz((1, 1, 1), (9, 8, 7), (11, 12, 13))
     center = torch.tensor(grid.center_xyz, dtype=torch.float64)
     eyes = torch.tensor([[9.0, 1, 20], [-8, 3, 19], [18, -4, 6]], dtype=torch.float64)
@@ -153,7 +142,7 @@ def test_the_mistake_is_named_that_blinds_all_cameras(
     assert words in explain_blindness(blind, blind, grid)
 
 
-def test_cameras_that_see_the_box_by_chance_are_asked_as_well() -> None:
+def test_cameras_that_see_the_box_by_chance_are_asked_as_well():
     """World to camera read as camera to world: some of many look at the box all the same."""
     middle = torch.tensor(GRID.center_xyz, dtype=torch.float64)
     turns = [0.4 + 0.8 * index for index in range(7)]
@@ -178,15 +167,7 @@ def test_cameras_that_see_the_box_by_chance_are_asked_as_well() -> None:
         ("25", "gte(N,20)*0.3", (0, 30), {}, ""),
     ],
 )
-def test_films_of_other_rates_are_refused(
-    read: Callable[..., SceneFile],
-    tmp_path: Path,
-    rate: str,
-    shift: str,
-    frames: tuple[int, int],
-    later: dict[str, Any],
-    apart: str,
-) -> None:
+def test_films_of_other_rates_are_refused(read, tmp_path, rate, shift, frames, later, apart):
     write_film(tmp_path / "front.mp4", 40, "25", *H264)
     write_film(tmp_path / "side.mov", 45, rate, *H264, shift=shift)
     views = [{"image": name, "camera": VIEW["camera"]} for name in ("front.mp4", "side.mov")]

@@ -1,8 +1,6 @@
 """The volume section as tensors: numbers, colors, files, labels, phase functions, two media."""
 
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,36 +14,33 @@ from ddrecon.medium.coefficients import mix_media
 from ddrecon.medium.phase import Blend, HenyeyGreenstein, Rayleigh, Tabulated, TwoLobe
 from ddrecon.numerics.autodiff import tensors_in
 from ddrecon.run.result import describe_result, result_names
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene
+from ddrecon.scene_file.load import describe, dump_scene
 from ddrecon.variables.values import value_of
 
-Load = Callable[..., Scene]
-Read = Callable[..., SceneFile]
 PAIR = ("sigma_a", "sigma_s")
 
 
-def save_field(folder: Path, name: str, *shape: int, bounds: np.ndarray = BOUNDS) -> np.ndarray:
+def save_field(folder, name, *shape, bounds=BOUNDS):
     values = np.random.default_rng(0).random(shape).astype(np.float32)
     write_field(folder / f"{name}.npz", name, values, bounds)
     return values
 
 
-def loaded_again(scene_file: SceneFile) -> Scene:
+def loaded_again(scene_file):
     """The scene of the file that is written for it."""
     path = scene_file.path.with_name("again.yaml")
     dump_scene(describe(scene_file), path)
     return load_scene(path)
 
 
-def test_extinction_and_albedo(load: Load):
+def test_extinction_and_albedo(load):
     medium = load(volume(PAIR, sigma_t=12, albedo=[0.95, 0.9, 0.8])).volume
     assert medium.sigma_a.tolist() == pytest.approx([0.6, 1.2, 2.4])
     assert medium.sigma_s.tolist() == pytest.approx([11.4, 10.8, 9.6])
 
 
-def test_fields_give_resolution_and_bounds_and_keep_their_order(load: Load, tmp_path: Path):
+def test_fields_give_resolution_and_bounds_and_keep_their_order(load, tmp_path):
     density = save_field(tmp_path, "density", 5, 4, 3)
     sigma_s = save_field(tmp_path, "sigma_s", 5, 4, 3, 3)
     files = {name: {"file": f"{name}.npz"} for name in ("density", "sigma_s")}
@@ -56,12 +51,12 @@ def test_fields_give_resolution_and_bounds_and_keep_their_order(load: Load, tmp_
     assert medium.sigma_s.is_contiguous()
 
 
-def test_bounds_agree_to_single_precision(load: Load, tmp_path: Path):
+def test_bounds_agree_to_single_precision(load, tmp_path):
     save_field(tmp_path, "density", *SHAPE, bounds=BOUNDS * (1 + 1e-7))
     assert load(volume(density={"file": "density.npz"})).volume.density.shape == SHAPE
 
 
-def test_gray_fields_take_the_colors_of_constants(load: Load, tmp_path: Path):
+def test_gray_fields_take_the_colors_of_constants(load, tmp_path):
     values = save_field(tmp_path, "albedo", *SHAPE)
     medium = load(volume(PAIR, sigma_t=[1, 2, 3], albedo={"file": "albedo.npz"})).volume
     for color in range(3):
@@ -70,7 +65,7 @@ def test_gray_fields_take_the_colors_of_constants(load: Load, tmp_path: Path):
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
-def test_values_by_height_are_linear_between_them_and_even_beyond(load: Load, up: str) -> None:
+def test_values_by_height_are_linear_between_them_and_even_beyond(load, up):
     """A ramp that ends within the box, of one number and of colors."""
     gas = {"heights": [-0.25, 0.25], "values": [[1, 2, 3], 1]}
     density = {"heights": [-9, 9], "values": [0, 18]}
@@ -82,7 +77,7 @@ def test_values_by_height_are_linear_between_them_and_even_beyond(load: Load, up
     torch.testing.assert_close(medium.sigma_a, expected)
 
 
-def test_values_by_label_are_those_of_fields(read: Read, tmp_path: Path) -> None:
+def test_values_by_label_are_those_of_fields(read, tmp_path):
     """A table of optical properties, of whose rows each cell's label picks one."""
     labels = np.random.default_rng(3).integers(0, 3, SHAPE)
     table = {"sigma_a": [[0, 0, 0], [1, 2, 3], 4], "sigma_s": [0.5, 0, 7], "g": [0, 0.9, -0.5]}
@@ -113,11 +108,11 @@ PHASES: dict[str, tuple[type, dict[str, Any]]] = {
 }
 
 
-def scene_with(**phase: Any) -> str:
+def scene_with(**phase):
     return changed(volume=BARE | {"phase": phase})
 
 
-def write_table(folder: Path, scale: float = 1.0) -> None:
+def write_table(folder, scale=1.0):
     """Rayleigh's phase function, times `scale`."""
     degrees = np.arange(0, 181, 5)
     values = scale * 0.75 * (1 + np.cos(np.radians(degrees)) ** 2)
@@ -126,7 +121,7 @@ def write_table(folder: Path, scale: float = 1.0) -> None:
 
 
 @pytest.mark.parametrize("name", PHASES)
-def test_each_kind_is_built_and_written_back(name: str, read: Read, tmp_path: Path) -> None:
+def test_each_kind_is_built_and_written_back(name, read, tmp_path):
     kind, numbers = PHASES[name]
     write_table(tmp_path)
     scene_file = read(scene_with(type=name, **numbers))
@@ -137,7 +132,7 @@ def test_each_kind_is_built_and_written_back(name: str, read: Read, tmp_path: Pa
     assert all(map(torch.equal, loaded, tensors_in(phase)))
 
 
-def test_a_table_of_another_scale_is_divided_with_a_warning(load: Load, tmp_path: Path) -> None:
+def test_a_table_of_another_scale_is_divided_with_a_warning(load, tmp_path):
     write_table(tmp_path, scale=4)
     with pytest.warns(DataWarning, match=r"table.csv: its mean over the sphere is 4"):
         phase = load(scene_with(type="table", file="table.csv")).volume.phase
@@ -145,7 +140,7 @@ def test_a_table_of_another_scale_is_divided_with_a_warning(load: Load, tmp_path
     torch.testing.assert_close(phase.value(cosine)[0], 0.75 * (1 + cosine**2), rtol=0, atol=2e-3)
 
 
-def test_droplets_scatter_as_one_sphere_does_and_forward(load: Load) -> None:
+def test_droplets_scatter_as_one_sphere_does_and_forward(load):
     miepython = pytest.importorskip("miepython", reason="needs the extra `mie`")
     droplets = {"refractive_index": 1.33, "effective_radius": 1.0, "effective_variance": 1e-4}
     phase = load(scene_with(type="mie", wavelength=[0.6, 0.5, 0.4], **droplets)).volume.phase
@@ -169,9 +164,7 @@ def test_droplets_scatter_as_one_sphere_does_and_forward(load: Load) -> None:
     ],
     ids=["short", "long", "weight", "another name"],
 )
-def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
-    medium: dict[str, Any], read: Read, tmp_path: Path
-) -> None:
+def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(medium, read, tmp_path):
     cells = np.linspace(0.2, 0.8, 24, dtype=np.float32).reshape(SHAPE)
     np.savez(tmp_path / "cells.npz", g=cells, weight=cells, bounds=BOUNDS)
     scene_file = read(changed(volume=BARE | medium))
@@ -180,7 +173,7 @@ def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
         assert np.array_equal(scene.volume.phase.cells[0], cells)
 
 
-def test_a_number_of_each_cell_is_optimized_from_one(load: Load) -> None:
+def test_a_number_of_each_cell_is_optimized_from_one(load):
     parameters = {"phase.weight": {"init": 0.4, "field": True}, "phase.g": {}}
     phase = {"type": "two_lobe", "g": [0.8, -0.3], "weight": 0.7}
     starts = load(
@@ -195,7 +188,7 @@ WATER = {name: VOLUME[name] for name in ("bounds", "resolution")}
 WATER |= {"sigma_t": {"meters": 1000}, "albedo": 1, "phase": DROPLETS}
 
 
-def test_droplets_differ_from_cell_to_cell(load: Load, tmp_path: Path) -> None:
+def test_droplets_differ_from_cell_to_cell(load, tmp_path):
     """Between ends that are exact, moments are those of droplets of each size."""
     pytest.importorskip("miepython")
     radius = np.array([7.0, 9.0, 11.0])
@@ -218,7 +211,7 @@ def test_droplets_differ_from_cell_to_cell(load: Load, tmp_path: Path) -> None:
 UNITS = {"density": "g/m3", "effective_radius": "um", "temperature": "K"}
 
 
-def water_of_file(path: Path, **units: str) -> str:
+def water_of_file(path, **units):
     """A scene of droplets: density 2 and radius 1 in these units, heat 300, from a netCDF file."""
     netcdf = pytest.importorskip("netCDF4", reason="needs the extra `netcdf`")
     known = {"density": 2.0, "effective_radius": 1.0, "temperature": 300.0}
@@ -240,9 +233,7 @@ def water_of_file(path: Path, **units: str) -> str:
         ({"density": ""}, 3000),
     ],
 )
-def test_files_of_droplets_are_read_in_their_units(
-    units: dict[str, str], expected: float, load: Load, tmp_path: Path, recwarn: Any
-) -> None:
+def test_files_of_droplets_are_read_in_their_units(units, expected, load, tmp_path, recwarn):
     """A gram in a cubic meter extinguishes 1500 / radius [micrometers] in a kilometer."""
     pytest.importorskip("miepython")
     medium = load(water_of_file(tmp_path / "les.nc", **units)).volume
@@ -253,9 +244,7 @@ def test_files_of_droplets_are_read_in_their_units(
     )
 
 
-def test_a_file_of_droplets_whose_box_is_in_another_unit_is_refused(
-    load: Load, tmp_path: Path
-) -> None:
+def test_a_file_of_droplets_whose_box_is_in_another_unit_is_refused(load, tmp_path):
     text = water_of_file(tmp_path / "les.nc")
     with pytest.importorskip("netCDF4").Dataset(tmp_path / "les.nc", "a") as file:
         for axis, count in zip("zyx", SHAPE, strict=True):
@@ -274,9 +263,7 @@ def test_a_file_of_droplets_whose_box_is_in_another_unit_is_refused(
         ("temperature", "degC", "kelvin"),
     ],
 )
-def test_files_in_units_of_other_quantities_are_refused(
-    name: str, unit: str, expected: str, load: Load, tmp_path: Path
-) -> None:
+def test_files_in_units_of_other_quantities_are_refused(name, unit, expected, load, tmp_path):
     text = water_of_file(tmp_path / "les.nc", **{name: unit})
     with pytest.raises(FormatError, match=f"les.nc: {name} is in {unit}, not {expected}"):
         load(text)
@@ -290,12 +277,12 @@ MEDIA = {"media": {"cloud": CLOUD, "air": AIR}}
 
 
 @pytest.fixture
-def cloud(tmp_path: Path) -> None:
+def cloud(tmp_path):
     write_field(tmp_path / "cloud.npz", "density", np.linspace(0, 1, 24).reshape(SHAPE), BOUNDS)
 
 
 @pytest.mark.usefixtures("cloud")
-def test_two_media_are_their_mixture_and_are_written_back(read: Read) -> None:
+def test_two_media_are_their_mixture_and_are_written_back(read):
     scene_file = read(changed(volume=MEDIA))
     mixture = build_scene(scene_file).volume
     assert mixture.grid.shape == SHAPE and isinstance(mixture.phase, Blend)
@@ -309,7 +296,7 @@ def test_two_media_are_their_mixture_and_are_written_back(read: Read) -> None:
 
 
 @pytest.mark.usefixtures("cloud")
-def test_what_is_found_of_a_medium_is_put_into_it(read: Read, tmp_path: Path) -> None:
+def test_what_is_found_of_a_medium_is_put_into_it(read, tmp_path):
     optimize = {"parameters": {"media.cloud.albedo": {"init": 0.5}, "media.air.sigma_s": {}}}
     text = changed(volume=MEDIA, optimize=optimize)
     scene_file = read(text, "optimize.parameters.media.cloud.g.init=0.3")

@@ -4,10 +4,7 @@ import itertools
 import json
 import math
 import struct
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,15 +17,13 @@ from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.build_views import remove_pictures
 from ddrecon.scene_file.camera_files import MODELS, UNMODELED, export_transforms
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     OpencvSection,
-    ViewSection,
 )
 from ddrecon.settings import LENSES
 
-Read = Callable[..., SceneFile]
 POSE = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, 0.6, 1.8], [0.0, -0.6, 0.8, 2.4], [0.0, 0.0, 0.0, 1.0]]
 MATRIX = tuple(map(tuple, POSE))
 """Looks at the origin, nearly: from behind it along z and from above along y."""
@@ -37,25 +32,25 @@ IGNORED = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "aa
 NERFSTUDIO = SIZES | IGNORED | {"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "ply_file_path": "a"}
 
 
-def frame(name: str | None = "images/frame_00001.npy", **others: Any) -> dict[str, Any]:
+def frame(name="images/frame_00001.npy", **others):
     path = {"file_path": name} if name else {}
     return path | {"transform_matrix": POSE, "sharpness": 37.5} | others
 
 
-def transforms(path: Path, *frames: dict[str, Any], **shared: Any) -> str:
+def transforms(path, *frames, **shared):
     """A scene whose views are in a file at `path`, which is written."""
     path.write_text(json.dumps(shared | {"frames": frames}))
     return changed(views={"transforms": path.name})
 
 
 @pytest.fixture
-def views(read: Read, tmp_path: Path) -> Callable[..., tuple[ViewSection, ...]]:
+def views(read, tmp_path):
     """The views of `frames` in a file that says what is `shared`."""
     path = tmp_path / "transforms.json"
     return lambda *frames, **shared: read(transforms(path, *frames, **shared)).tree.views
 
 
-def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
+def test_rays_are_those_of_the_calibration(read, tmp_path):
     """Pixel centers, +y up and looking along -z; other programs' boxes change nothing."""
     read(transforms(tmp_path / "transforms.json", frame(None), **NERFSTUDIO))
     (view,) = load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views
@@ -67,7 +62,7 @@ def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
         torch.testing.assert_close(bundle.direction[index].flip(0), toward, rtol=0, atol=1e-14)
 
 
-def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
+def test_nerf_synthetic_data(read, tmp_path):
     """An angle alone, images without a suffix, whose size is theirs, and a file for each split."""
     for split in ("train", "val"):
         path = tmp_path / f"transforms_{split}.json"
@@ -80,11 +75,11 @@ def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
     assert train.camera.fov == pytest.approx(math.degrees(0.6)) and not train.camera.resolution
 
 
-def angle(focal: float, pixels: int) -> float:
+def angle(focal, pixels):
     return 2 * math.atan(pixels / 2 / focal)
 
 
-def focal(x: float, y: float, width: int = 8) -> dict[str, float]:
+def focal(x, y, width=8):
     """What a camera has of focal lengths in pixels."""
     return {"fov": math.degrees(angle(x, width)), "pixel_aspect": x / y}
 
@@ -145,9 +140,7 @@ def test_a_frame_may_have_a_mask(views, tmp_path):
         ("r_0", ["r_0"], "r_0"),
     ],
 )
-def test_which_picture_a_name_means(
-    views: Any, tmp_path: Path, name: str, existing: list[str], image: str
-) -> None:
+def test_which_picture_a_name_means(views, tmp_path, name, existing, image):
     (tmp_path / "images").mkdir()
     for file in existing:
         (tmp_path / file).touch()
@@ -155,7 +148,7 @@ def test_which_picture_a_name_means(
     assert view.image == tmp_path / image
 
 
-def test_a_file_of_windows_is_read(read: Read, tmp_path: Path) -> None:
+def test_a_file_of_windows_is_read(read, tmp_path):
     """With a byte order mark, as its editors write text."""
     before = read(transforms(tmp_path / "a.json", frame(), **NERFSTUDIO))
     for path in (tmp_path / "a.json", tmp_path / "scene.yaml"):
@@ -180,9 +173,7 @@ def test_a_file_of_windows_is_read(read: Read, tmp_path: Path) -> None:
         ("transforms.json", {"val": []}, None, "....."),
     ],
 )
-def test_which_views_are_held_out(
-    read: Read, tmp_path: Path, name: str, more: Any, test_every: int | None, expected: str
-) -> None:
+def test_which_views_are_held_out(read, tmp_path, name, more, test_every, expected):
     """Which of five are training views (.), and which test views (t)."""
     lists = {f"{split}_filenames": names for split, names in more.items()}
     transforms(tmp_path / name, *(frame(f"{i}.png") for i in range(5)), **NERFSTUDIO, **lists)
@@ -201,7 +192,7 @@ def test_which_views_are_held_out(
         ([f"{'n' * 240}{index}.png" for index in (0, 1)], ["n" * 98 + "0", "n" * 98 + "1"]),
     ],
 )
-def test_names_are_legal_and_differ(views: Any, files: list[Any], names: list[str]) -> None:
+def test_names_are_legal_and_differ(views, files, names):
     assert [view.name for view in views(*map(frame, files), **NERFSTUDIO)] == names
 
 
@@ -239,9 +230,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("row", WRONG.strip().split("\n"))
-def test_what_is_no_camera_of_ours_is_refused_by_key(
-    refusal: Any, tmp_path: Path, row: str
-) -> None:
+def test_what_is_no_camera_of_ours_is_refused_by_key(refusal, tmp_path, row):
     text, _, problem = row.partition(" => ")
     for word, number in NUMBERS.items():
         text = text.replace(word, number)
@@ -252,7 +241,7 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
     assert line.startswith(f"t.json: {problem}")
 
 
-def test_a_film_begins_at_its_time(read: Read, views: Any, tmp_path: Path) -> None:
+def test_a_film_begins_at_its_time(read, views, tmp_path):
     """What others call a time, of pictures, is none; it comes back when views are exported."""
     timed = views(frame("a.mp4", time=0.5), frame("b.png", time=0.5), **NERFSTUDIO)
     assert [view.time for view in timed] == [0.5, 0.0]
@@ -263,7 +252,7 @@ def test_a_film_begins_at_its_time(read: Read, views: Any, tmp_path: Path) -> No
     assert (first["time"], first["file_path"]) == (0.5, "a.mp4")
 
 
-def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
+def test_what_is_exported_comes_back(read, tmp_path):
     """Cameras, images, masks and splits, also from a folder of its own."""
     (tmp_path / "images").mkdir()
     (tmp_path / "out").mkdir()
@@ -299,7 +288,7 @@ DISTORTED = {
 
 
 @pytest.mark.parametrize("model", DISTORTED)
-def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> None:
+def test_lenses_are_read_and_written(read, tmp_path, model):
     """Through our own scene files and transforms, to the same rays."""
     numbers = SIZES | IGNORED | {"camera_model": model, **DISTORTED[model]}
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
@@ -317,7 +306,7 @@ LEFT = {"w": 40, "h": 1000, "fl_x": 20.0, "fl_y": 2e3, "cx": 0.0, "cy": 500.0, "
 
 
 @pytest.mark.parametrize("numbers", [NERFSTUDIO | {"k1": -12.0}, LEFT])
-def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path, numbers: Any) -> None:
+def test_a_lens_that_folds_over_is_refused(read, tmp_path, numbers):
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
     with pytest.raises(SceneError, match="folds over within the image") as caught:
         build_scene(scene_file)
@@ -339,7 +328,7 @@ SHIFT = np.array([0.1, -0.2, 3.0])
 """Of a camera that looks at the world's origin from 3 u away, nearly."""
 
 
-def rotation(quaternion: np.ndarray) -> np.ndarray:
+def rotation(quaternion):
     """By the sandwich q v q*, vector by vector."""
     w, *axis = quaternion / np.linalg.norm(quaternion)
     u = np.array(axis)
@@ -347,7 +336,7 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
+def write_text(folder, model, name="b c.png"):
     folder.mkdir(parents=True, exist_ok=True)
     numbers = " ".join(map(str, CAMERAS[model]))
     (folder / "cameras.txt").write_text(f"# cameras\n7 {model} 8 6 {numbers}\n")
@@ -358,9 +347,7 @@ def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
     )
 
 
-def write_binary(
-    folder: Path, model: str, name: str = "b c.png", points: tuple[int, int] = (2, 0)
-) -> None:
+def write_binary(folder, model, name="b c.png", points=(2, 0)):
     folder.mkdir(parents=True, exist_ok=True)
     numbers = CAMERAS[model]
     header = struct.pack("<QiiQQ", 1, 7, list(MODELS).index(model), 8, 6)
@@ -372,15 +359,13 @@ def write_binary(
     (folder / "images.bin").write_bytes(content)
 
 
-def scene_text(**others: Any) -> str:
+def scene_text(**others):
     return changed(views={"colmap": "sparse/0", "images": "pictures", **others})
 
 
 @pytest.mark.parametrize("store", [write_text, write_binary])
 @pytest.mark.parametrize("model", CAMERAS)
-def test_points_are_seen_where_the_manual_says(
-    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
-) -> None:
+def test_points_are_seen_where_the_manual_says(read, tmp_path, model, store):
     """x = R X + t, divided by its depth, distorted, and times the focal lengths plus the center."""
     store(tmp_path / "sparse/0", model)
     scene_file = read(scene_text())
@@ -417,7 +402,7 @@ POINTS = "1.5 2.5 -1 3.5 4.5 12"
         ["", "", "a.png", "", "  ", "# c", "b 10.png", POINTS, "", "b 2.png"],
     ],
 )
-def test_lines_of_points_may_be_missing(read: Read, tmp_path: Path, lines: list[str]) -> None:
+def test_lines_of_points_may_be_missing(read, tmp_path, lines):
     """No image is taken for points; pictures are in order of their numbers."""
     write_text(tmp_path / "sparse/0", "PINHOLE")
     text = [f"{IMAGE} {line}" if line.endswith("png") else line for line in lines]
@@ -426,7 +411,7 @@ def test_lines_of_points_may_be_missing(read: Read, tmp_path: Path, lines: list[
     assert found == [("a", "test"), ("b_2", "train"), ("b_10", "test")]
 
 
-def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
+def test_models_of_windows_are_read(read, tmp_path):
     """With a byte order mark, other ends of lines, and backslashes; but not out of the folder."""
     folder = tmp_path / "sparse/0"
     write_text(folder, "PINHOLE", "left\\c.png")
@@ -442,9 +427,7 @@ def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("model", UNMODELED)
-def test_cameras_that_no_image_has_may_be_of_any_model(
-    read: Read, tmp_path: Path, model: str
-) -> None:
+def test_cameras_that_no_image_has_may_be_of_any_model(read, tmp_path, model):
     """As text, and in a binary file, which says nothing of their length."""
     text, binary, count = tmp_path / "sparse/0", tmp_path / "sparse/1", UNMODELED[model]
     write_text(text, "PINHOLE")
@@ -475,9 +458,7 @@ def test_cameras_that_no_image_has_may_be_of_any_model(
         ("images.txt", "0.2 0.9 -0.3 0.1 0.1", "0 0 0 0 0.1", "not finite, or no rotation"),
     ],
 )
-def test_a_damaged_text_is_refused(
-    read: Read, tmp_path: Path, file: str, old: str, new: str, problem: str
-) -> None:
+def test_a_damaged_text_is_refused(read, tmp_path, file, old, new, problem):
     write_text(tmp_path / "sparse/0", "PINHOLE")
     path = tmp_path / "sparse/0" / file
     assert old in path.read_text()
@@ -488,7 +469,7 @@ def test_a_damaged_text_is_refused(
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
-def test_a_damaged_binary_is_refused(read: Read, tmp_path: Path, file: str) -> None:
+def test_a_damaged_binary_is_refused(read, tmp_path, file):
     """Cut anywhere, in points that are skipped as well, or claiming more than there is."""
     write_binary(tmp_path / "sparse/0", "OPENCV", points=(0, 2))
     path = tmp_path / "sparse/0" / file

@@ -1,7 +1,6 @@
 """Scene files as records: each rule of the schema, told with line, column and key."""
 
 import math
-from collections.abc import Callable
 from operator import sub
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from example_scene import CAMERA, SCENE, changed, volume
 from ddrecon.scene import upright_axis
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import (
-    SceneFile,
     describe,
     dump_scene,
     read_scene,
@@ -22,9 +20,6 @@ from ddrecon.scene_file.load import (
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
 from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
-
-Read = Callable[..., SceneFile]
-Refusal = Callable[..., list[str]]
 
 CONTRACT = """\
 volume:
@@ -63,7 +58,7 @@ optimize:
 """
 
 
-def test_the_example_of_the_contract(read: Read, tmp_path: Path):
+def test_the_example_of_the_contract(read, tmp_path):
     tree = read(CONTRACT).tree
     box, density = Bounds((-0.5, -0.75, -0.5), (0.5, 0.75, 0.5)), FieldFile(tmp_path / "plume.npz")
     medium = {"sigma_a": 0.6, "sigma_s": (11.4, 10.8, 9.6), "g": 0.3}
@@ -76,7 +71,7 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
     assert tree.optimize == OptimizeSettings({"density": density}, 300, loss="l2")
 
 
-def test_every_error_is_told_at_once_with_its_place(refusal: Refusal):
+def test_every_error_is_told_at_once_with_its_place(refusal):
     text = SCENE.replace("g: 0.3", "g: 1").replace("density:", "densty:")
     text = text.replace("fov: 28", "fov: 0")
     lines = refusal(text, "render.steps_per_voxel=1.5", "lights.5.radiance=1")
@@ -90,7 +85,7 @@ def test_every_error_is_told_at_once_with_its_place(refusal: Refusal):
     ]
 
 
-def test_left_out_names_count_from_zero_and_all_are_unique(read: Read, refusal: Refusal):
+def test_left_out_names_count_from_zero_and_all_are_unique(read, refusal):
     views = f"views:\n  - {{name: view_01, camera: {CAMERA}}}\n  - {{camera: {CAMERA}}}\n"
     text = SCENE[: SCENE.index("views:")] + views
     assert refusal(text) == ["scene.yaml:13:5: views.1: 'view_01' is already the name of view 0"]
@@ -98,7 +93,7 @@ def test_left_out_names_count_from_zero_and_all_are_unique(read: Read, refusal: 
     assert [view.name for view in views] == ["view_02", "view_01"]
 
 
-def test_overrides_replace_add_and_reach_into_lists(read: Read):
+def test_overrides_replace_add_and_reach_into_lists(read):
     overrides = ["volume.g=0.5", "lights.1.radiance=[1, 2, 3]", "volume.g=0.6", "render={}"]
     overrides += ["optimize.parameters.density.tv=1e-2"]
     tree = read(SCENE, *overrides).tree
@@ -121,9 +116,7 @@ TYPED = {
 
 
 @pytest.mark.parametrize(("override", "files"), TYPED.items())
-def test_paths_that_are_typed_start_at_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, override: str, files: list[str]
-) -> None:
+def test_paths_that_are_typed_start_at_the_current_folder(tmp_path, monkeypatch, override, files):
     """Those of the scene start at its folder, as ever."""
     monkeypatch.chdir(tmp_path)
     Path("shoot").mkdir()
@@ -136,7 +129,7 @@ def test_paths_that_are_typed_start_at_the_current_folder(
 
 
 @pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])
-def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
+def test_overrides_add_parameters_whose_names_have_dots(read, name):
     text = SCENE + "optimize: {parameters: {density: {}}}\n"
     optimize = read(text, f"optimize.parameters.{name}.max=0.5").tree.optimize
     assert optimize is not None and optimize.parameters[name].max == 0.5
@@ -144,7 +137,7 @@ def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
     assert optimize.parameters.keys() == {"density", name}
 
 
-def test_marks_lead_later_errors_to_the_line(read: Read):
+def test_marks_lead_later_errors_to_the_line(read):
     scene_file = read(SCENE, "volume.g=0.1")
     for key, place in {"lights.1.radiance": "10:31", "views.0.image.never.written": "12:5"}.items():
         line = str(scene_file.refused(key, "odd"))
@@ -157,7 +150,7 @@ FLAT = {"type": "orthographic", "width": 2, "matrix": MATRIX, "resolution": [4, 
 
 
 @pytest.mark.parametrize("text", [SCENE, CONTRACT, changed(views=[{"camera": FLAT}])])
-def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_path: Path):
+def test_a_dumped_scene_reads_back_as_the_same_tree(read, text, tmp_path):
     overrides = ["views.0.name='1e5'", "diffusion.tolerance=1e-5"]
     overrides += ["optimize.parameters.density={init: {file: a b.npz}, max: 7}"]
     scene_file = read(text, *overrides)
@@ -173,7 +166,7 @@ CIRCLE = {"count": 3, "radius": 3.2, "height": 0.3, "fov": 28, "resolution": [8,
 
 
 @pytest.mark.parametrize("up", range(3))
-def test_a_ring_goes_around_its_target_about_the_way_up(up: int) -> None:
+def test_a_ring_goes_around_its_target_about_the_way_up(up):
     """From the axis after it, x, y, z and x again, towards the one after that."""
     upright, ahead, aside = up, (up + 1) % 3, (up + 2) % 3
     along = (float(up == 0), float(up == 1), float(up == 2))
@@ -191,7 +184,7 @@ def test_a_ring_goes_around_its_target_about_the_way_up(up: int) -> None:
 
 
 @pytest.mark.parametrize("up", "xyz")
-def test_the_volume_says_what_is_up(read: Read, up: str) -> None:
+def test_the_volume_says_what_is_up(read, up):
     axis, volume = "xyz".index(up), yaml.safe_load(SCENE)["volume"] | {"up": up}
     scene_file = read(changed(volume=volume, views={"ring": CIRCLE}))
     assert upright_axis(build_scene(scene_file)) == axis
@@ -199,7 +192,7 @@ def test_the_volume_says_what_is_up(read: Read, up: str) -> None:
     assert [view.camera.origin[axis] for view in views] == [CIRCLE["height"]] * 3
 
 
-def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None:
+def test_ring_views_have_names_and_no_images(read, tmp_path):
     scene_file = read(changed(views={"ring": CIRCLE, "test_every": 2}))
     views = scene_file.tree.views
     assert [view.name for view in views] == ["ring_00", "ring_01", "ring_02"]
@@ -217,9 +210,7 @@ def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None
     ],
 )
 @pytest.mark.parametrize("pattern", ["targets/t_*.exr", "targets\\t_*.exr"])
-def test_images_are_in_order_of_their_numbers(
-    read: Read, tmp_path: Path, names: list[str], pattern: str
-) -> None:
+def test_images_are_in_order_of_their_numbers(read, tmp_path, names, pattern):
     """Of files alone, which are relative to the scene."""
     (tmp_path / "targets").mkdir()
     paths = [tmp_path / "targets" / f"t_{name}.exr" for name in names]
@@ -231,9 +222,7 @@ def test_images_are_in_order_of_their_numbers(
 
 
 @pytest.mark.parametrize("names", [["0.25", "0.5", "1"], ["-30", "0", "30"], ["1.9", "1.10", "2"]])
-def test_an_order_that_is_not_plain_is_refused(
-    refusal: Callable[..., list[str]], tmp_path: Path, names: list[str]
-) -> None:
+def test_an_order_that_is_not_plain_is_refused(refusal, tmp_path, names):
     for name in names:
         (tmp_path / f"t_{name}.exr").touch()
     (line,) = refusal(changed(views={"ring": CIRCLE, "images": "t_*.exr"}))

@@ -1,7 +1,5 @@
 """What is wrong with a scene is one line: the place, the key, what to do; one table of it all."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from example_scene import SCENE
@@ -146,7 +144,7 @@ views={transforms: bad.json} => bad.json: not JSON
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder with the scene, and files that are good or bad in one way each."""
     folder = tmp_path_factory.mktemp("scene")
     (folder / "scene.yaml").write_text(SCENE)
@@ -169,11 +167,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def in_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_folder(folder, monkeypatch):
     monkeypatch.chdir(folder)
 
 
-def rows(table: str) -> list[tuple[str, str]]:
+def rows(table):
     return [
         (override, line)
         for override, _, line in (row.partition(" => ") for row in table.split("\n")[1:-1])
@@ -181,7 +179,7 @@ def rows(table: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("override", "line"), rows(SCENES))
-def test_what_is_wrong_with_a_scene(folder: Path, override: str, line: str) -> None:
+def test_what_is_wrong_with_a_scene(folder, override, line):
     overrides = override.split(" & ")
     if override.startswith("optimize.") and not override.startswith("optimize.parameters={"):
         overrides.insert(0, "optimize={parameters: {density: {}}}")
@@ -193,14 +191,14 @@ def test_what_is_wrong_with_a_scene(folder: Path, override: str, line: str) -> N
 
 
 @pytest.mark.parametrize(("override", "line"), rows(FILES))
-def test_what_is_wrong_with_a_file(folder: Path, override: str, line: str) -> None:
+def test_what_is_wrong_with_a_file(folder, override, line):
     with pytest.raises(FormatError) as caught:
         load_scene(folder / "scene.yaml", overrides=[override])
     (problem,) = caught.value.lines
     assert line in problem.replace(f"{folder}/", "") and problem.startswith(f"{folder}/")
 
 
-def test_what_a_field_may_hold_depends_on_what_it_is_used_for(folder: Path) -> None:
+def test_what_a_field_may_hold_depends_on_what_it_is_used_for(folder):
     """Not on its name in the file: below 0 is no density, but some g."""
     scene = load_scene(folder / "scene.yaml", overrides=["volume.g={file: cells.npz, name: below}"])
     assert float(scene.volume.phase.g.max()) < 0

@@ -1,8 +1,6 @@
 """Strict YAML: what a scalar means, and what text is refused, with its line and column."""
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -11,9 +9,6 @@ from hypothesis import strategies as st
 from ddrecon.errors import Problems, SceneError
 from ddrecon.scene_file.load import MAX_BYTES, read_scene
 from ddrecon.scene_file.read import parse, resolve
-
-Refusal = Callable[..., list[str]]
-
 
 WHOLE = {"010": 10, "-7": -7}
 WORDS = {"true": True, "False": False, "null": None, "~": None, "": None, ".inf": math.inf}
@@ -26,12 +21,12 @@ PLAIN |= {
 
 
 @pytest.mark.parametrize(("text", "value"), PLAIN.items())
-def test_plain_scalars_follow_yaml_1_2(text: str, value: object):
+def test_plain_scalars_follow_yaml_1_2(text, value):
     assert resolve(text) == value and type(resolve(text)) is type(value)
 
 
 @given(st.floats(allow_nan=False))
-def test_every_float_is_read_as_python_or_json_writes_it(number: float):
+def test_every_float_is_read_as_python_or_json_writes_it(number):
     if math.isfinite(number):
         assert resolve(repr(number)) == number
 
@@ -68,25 +63,25 @@ def test_a_tree_is_what_yaml_says_and_nodes_know_their_places():
         ("hello", "scene.yaml:1:1: expected a mapping, found 'hello'"),
     ],
 )
-def test_what_is_not_strict_yaml_is_refused_in_one_line(refusal: Refusal, text: str, line: str):
+def test_what_is_not_strict_yaml_is_refused_in_one_line(refusal, text, line):
     (problem_line,) = refusal(text)
     assert line in problem_line
 
 
-def test_deep_nesting_is_refused_not_a_crash(refusal: Refusal):
+def test_deep_nesting_is_refused_not_a_crash(refusal):
     (line,) = refusal("[" * 20_000)
     assert "nested more than 32 deep" in line
 
 
-def test_repeated_and_empty_keys_are_found_at_every_level(refusal: Refusal):
+def test_repeated_and_empty_keys_are_found_at_every_level(refusal):
     lines = refusal("volume: {g: 0, g: 1, '': 1}\nlights: []\nlights: []\n")
     assert lines[0] == "scene.yaml:1:16: volume.g: repeated key; it is already at scene.yaml:1:10"
     assert lines[1] == "scene.yaml:3:1: lights: repeated key; it is already at scene.yaml:2:1"
     assert any(line.startswith("scene.yaml:1:22: volume.'': unknown key") for line in lines)
 
 
-def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
-    def problem(path: Path) -> str:
+def test_absent_large_and_binary_files_are_refused(tmp_path):
+    def problem(path):
         with pytest.raises(SceneError) as caught:
             read_scene(path)
         return str(caught.value)

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from media import half_empty, random_values
-from torch import Tensor
-from twins import Function, Tensors, assert_same, assert_twins, differentiate
+from twins import assert_same, assert_twins, differentiate
 
 from ddrecon.grid import Grid
 from ddrecon.light.moments import cut
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.transport.fused import ordinates
 from ddrecon.transport.rounds import face_mirror
 from ddrecon.transport.sweep import sweep_change
@@ -52,14 +51,14 @@ class Case:
     index: float = 1.0
 
     @property
-    def grid(self) -> Grid:
+    def grid(self):
         z, y, x = (n * step for n, step in zip(self.shape, self.spacing, strict=True))
         return Grid(self.shape, (0.0, 0.0, 0.0), (z, y, x), periodic=self.periodic)
 
-    def values(self) -> dict[str, Tensor]:
+    def values(self):
         """All that a sweep depends on, by name."""
 
-        def random(*shape: int, seed: int) -> Tensor:
+        def random(*shape, seed):
             return random_values(*shape, seed=seed, dtype=self.dtype)
 
         found = {"density": self.depth * half_empty(*self.shape, dtype=self.dtype)}
@@ -80,17 +79,17 @@ class Case:
             found["inflow"] = random(self.colors, 1, 1, 1, seed=7)
         return found
 
-    def medium(self, values: dict[str, Tensor]) -> Medium:
+    def medium(self, values):
         density, sigma_a, sigma_s = (values[name] for name in ("density", "sigma_a", "sigma_s"))
         g = values.get("g", density.new_zeros(()))
         volume = Volume(self.grid, density, sigma_a, sigma_s, g, index=self.index)
         return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
 
 
-def moments_of(case: Case) -> Function:
+def moments_of(case):
     """The moments of the change that a sweep finds, of all that it depends on."""
 
-    def find(values: Tensors) -> list[Tensor]:
+    def find(values):
         medium = case.medium(values)
         lights = cut(values["light"]), cut(values["source"])
         # What faces reflect has left them in the sweep before.
@@ -104,7 +103,7 @@ def moments_of(case: Case) -> Function:
     return find
 
 
-def found_of(case: Case, engine: str = "warp") -> Tensors:
+def found_of(case, engine="warp"):
     return differentiate(engine, moments_of(case), case.values())
 
 
@@ -137,28 +136,26 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_moments_and_gradients_are_those_of_torch(case: Case):
+def test_moments_and_gradients_are_those_of_torch(case):
     assert_same(found_of(case), known_of(case), 1e-12)
 
 
 @pytest.mark.parametrize("spacing", [CUBES, FLAT], ids=str)
-def test_single_precision(spacing: tuple[float, float, float]):
+def test_single_precision(spacing):
     """Beside the same numbers in double precision; rows have two vectors and a rest."""
     case = Case((4, 5, 37), spacing)
     assert_same(found_of(replace(case, dtype=torch.float32)), known_of(case), 2e-6)
 
 
 @pytest.mark.parametrize("varied", [["source"], ["density", "inflow"]], ids=str)
-def test_some_derivatives_are_asked_for(varied: list[str]):
+def test_some_derivatives_are_asked_for(varied):
     values = Case().values()
     some = {name: values[name] for name in varied}
     assert_twins(lambda given: moments_of(Case())(values | given), some)
 
 
 @pytest.mark.parametrize("case", [Case(directions=44), Case((5, 6, 7), CUBES, colors=1)], ids=str)
-def test_it_does_not_matter_which_ordinates_go_together(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_does_not_matter_which_ordinates_go_together(case, monkeypatch):
     """Few or all in a chunk, in one thread or in pieces of their own in many."""
     together = found_of(case)
     monkeypatch.setattr(ordinates, "MOST", 3)
@@ -170,7 +167,7 @@ def test_it_does_not_matter_which_ordinates_go_together(
 
 
 @pytest.mark.parametrize("fill", [1, 200, 10**6])
-def test_chunks_by_cells_may_have_any_size(fill: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_by_cells_may_have_any_size(fill, monkeypatch):
     for name in ("FILL_GPU", "FILL_CACHE"):
         monkeypatch.setattr(ordinates, name, fill)
     case = Case((3, 4, 5), periodic=(0,), directions=18)
@@ -179,7 +176,7 @@ def test_chunks_by_cells_may_have_any_size(fill: int, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("name", ["color", "44", "around-zx", "refracting"])
-def test_cells_of_a_slice_may_be_done_in_any_order(name: str, order: str) -> None:
+def test_cells_of_a_slice_may_be_done_in_any_order(name, order):
     with as_on_a_gpu(order):
         found = found_of(CASES[name])
     assert_same(found, known_of(CASES[name]), 1e-12)

@@ -1,13 +1,11 @@
 """Transport rounds: where they lead, how fast, in thick cells, and what derivatives cost."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
 
 import pytest
 import torch
 from media import count_kept, make_scene
-from torch import Tensor
 
 from ddrecon.bench import ball as hard_ball
 from ddrecon.bench import layer
@@ -17,13 +15,12 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.engine import use_engine
-from ddrecon.grid import Grid, Triple
+from ddrecon.grid import Grid
 from ddrecon.light.moments import cut
 from ddrecon.light.reduced import receive_light
 from ddrecon.lighting import solve_light
-from ddrecon.medium.coefficients import Medium, scale_medium
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.picture import render
-from ddrecon.scene import Scene
 from ddrecon.transport.rounds import run_rounds
 from ddrecon.transport.sweep import emitted_light, steep_gradient, sweep
 
@@ -31,25 +28,25 @@ CUBES = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture(autouse=True)
-def whatever_is_fastest(same_engine: None) -> None:
+def whatever_is_fastest(same_engine):
     """What holds of rounds holds with either engine, to rounding (`test_fused_sweep.py`)."""
     use_engine("auto")
 
 
-def ball(cells: int = 12, radius: float = 0.35) -> Tensor:
+def ball(cells=12, radius=0.35):
     """A soft ball of density 1 in a box of unit sides (see `make_scene`)."""
     x = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells - 0.5
     distance = (x[:, None, None] ** 2 + x[None, :, None] ** 2 + x**2).sqrt()
     return ((radius - distance) * cells / 3 + 0.5).clamp(0, 1)
 
 
-def light_after(scene: Scene, rounds: int) -> Tensor:
+def light_after(scene, rounds):
     """L0 after so many rounds."""
     scene = replace(scene, diffusion=replace(scene.diffusion, transport_rounds=rounds))
     return solve_light(scene, SolveMemory()).diffuse[0]
 
 
-def swept_of(medium: Medium, scatters: Tensor, directions: int) -> Tensor:
+def swept_of(medium, scatters, directions):
     """The moments of the radiance of what `scatters`."""
     emitted = emitted_light(medium, cut(scatters))
     rise = steep_gradient(medium, scatters[0], directions)
@@ -69,7 +66,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
 
 
 @pytest.mark.parametrize(("g", "engine"), [(0.0, "warp"), (0.6, "torch"), (0.85, "warp")])
-def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g: float, engine: str):
+def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g, engine):
     """And light is as near to its limit as that says, in fewer rounds the larger it is."""
     scene = make_scene(ball(), sigma_a=(1.0,), sigma_s=(20.0,), g=g, directional=(3.0,))
     records, found = [], []
@@ -86,9 +83,7 @@ def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g: float, engin
     assert 1 <= records[0].iterations < records[1].iterations < 16
 
 
-def left_of_noise(
-    density: Tensor, spacing: Triple, depth: float, g: float, degree: int, rounds: Sequence[int]
-) -> list[float]:
+def left_of_noise(density, spacing, depth, g, degree, rounds):
     """Sizes of what so many rounds leave of noise, which holds all waves, without any source.
 
     `depth` is that of cells of density 1 along their shortest side.
@@ -119,7 +114,7 @@ def left_of_noise(
     ("g", "degree", "thickness"),
     [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.85, 5, 1.5), (0.85, 7, 1.5), (0.95, 5, 1.5), (0.95, 7, 6.0)],
 )
-def test_rounds_forget_where_they_began(g: float, degree: int, thickness: float):
+def test_rounds_forget_where_they_began(g, degree, thickness):
     """In a box full of medium, where diffusion passes few waves on."""
     full = torch.ones(12, 12, 12, dtype=torch.float64)
     (begun, left) = left_of_noise(full, CUBES, thickness, g, degree, (0, 16))
@@ -132,7 +127,7 @@ VOLUMES = [torch.ones, hard_ball, layer]
 
 
 @pytest.mark.parametrize(("shape", "volume"), [*product(range(4), range(3))])
-def test_what_is_left_shrinks_in_hard_volumes(shape: int, volume: int):
+def test_what_is_left_shrinks_in_hard_volumes(shape, volume):
     """Up to faces and corners, where density jumps by 1e6, and in flat and long cells.
 
     Each two of a volume, a spacing and a phase function meet.
@@ -147,7 +142,7 @@ def test_what_is_left_shrinks_in_hard_volumes(shape: int, volume: int):
 
 
 @pytest.mark.parametrize("g", [1e-9, -1e-9])
-def test_light_without_direction_is_the_limit_of_light_with(g: float):
+def test_light_without_direction_is_the_limit_of_light_with(g):
     plain, nearly = (
         make_scene(ball(8), g=value, directional=(3.0,), transport_rounds=2, tolerance=1e-11)
         for value in (0.0, g)

@@ -1,7 +1,6 @@
 """Sweeps and rounds: slow twins by loops over directions, slices and cells; closed forms."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -9,26 +8,23 @@ import numpy as np
 import pytest
 import torch
 from media import box_grid, dense_matrix, half_empty, random_values, tensor
-from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.solve import solve_by_multigrid
-from ddrecon.grid import Grid
 from ddrecon.light.moments import cut, fill
-from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.numerics.sphere import harmonics, sphere_quadrature
-from ddrecon.transport.characteristics import Characteristic, Direction, radiance_along
+from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds
 from ddrecon.transport.sweep import cell_gradient, emitted_light, steep_gradient, sweep
 
-Cell = tuple[int, int, int]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 """Gauss's rule on [0, 1]."""
 
 
-def arriving(leaving: Tensor, cell: Cell, moved: list[float], edge: float) -> float:
+def arriving(leaving, cell, moved, edge):
     """The mean of what cells around `cell` - `moved` let through; beyond the box, `edge`."""
     total = 0.0
     for corner in product((0, 1), repeat=3):
@@ -42,7 +38,7 @@ def arriving(leaving: Tensor, cell: Cell, moved: list[float], edge: float) -> fl
     return total
 
 
-def rise_at(q: Tensor, cell: Cell, moved: list[float]) -> float:
+def rise_at(q, cell, moved):
     """How much `q` [z, y, x] rises over `moved` cells, by differences of the nearest neighbors."""
     total = 0.0
     for axis, m in enumerate(moved):
@@ -54,14 +50,7 @@ def rise_at(q: Tensor, cell: Cell, moved: list[float]) -> float:
     return total
 
 
-def by_cells(
-    medium: Medium,
-    scatters: Tensor,
-    even: Tensor,
-    direction: Direction,
-    inflow: float = 0.0,
-    steep: Sequence[Tensor] = (),
-) -> Tensor:
+def by_cells(medium, scatters, even, direction, inflow=0.0, steep=()):
     """Means of I [z, y, x] of a gray medium, cell after cell (E2.9); `even` has the slope of q.
 
     It is `steep` times as much by axis, if given. With what is emitted at the part s of a way, and
@@ -85,18 +74,18 @@ def by_cells(
     return means
 
 
-def fastest_axis(grid: Grid, direction: Direction) -> tuple[int, float]:
+def fastest_axis(grid, direction):
     """The axis along which most cells are crossed, and the length of the way through one."""
     steps = [h / max(abs(c), 1e-300) for c, h in zip(direction, grid.spacing, strict=True)]
     return steps.index(min(steps)), min(steps)
 
 
-def quadrature(directions: int) -> list[tuple[Direction, float]]:
+def quadrature(directions):
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     return list(zip(map(tuple, points.tolist()), weights.tolist(), strict=True))
 
 
-def steepness(medium: Medium, directions: int) -> list[Tensor]:
+def steepness(medium, directions):
     """1 + 2 x d sqrt(36 + d^2) / (d^2 + 0.01) of E2.16, by axis [z, y, x]."""
     over, first, second = np.zeros(3), np.zeros(3), np.zeros(3)
     for w, weight in quadrature(directions):
@@ -110,9 +99,7 @@ def steepness(medium: Medium, directions: int) -> list[Tensor]:
     return [1 + x * d * (36 + d**2).sqrt() / (d**2 + 0.01) for x, d in each]
 
 
-def sweep_by_loops(
-    medium: Medium, source: Tensor, even: Tensor, inflow: float, directions: int
-) -> Tensor:
+def sweep_by_loops(medium, source, even, inflow, directions):
     """The means of I Y_k [K, 1, z, y, x] (E2.8), gray, one direction after another."""
     total, steep = torch.zeros_like(source), steepness(medium, directions)
     degree = math.isqrt(len(source)) - 1
@@ -123,7 +110,7 @@ def sweep_by_loops(
     return total
 
 
-def share_by_loops(medium: Medium, directions: int) -> Tensor:
+def share_by_loops(medium, directions):
     """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step.
 
     And kappa_t 3/2 of the mean of t (1 - t) h^2 / step, along the axis where that is most.
@@ -151,28 +138,19 @@ def share_by_loops(medium: Medium, directions: int) -> Tensor:
     return share
 
 
-def remaining_by_formula(g: float, degree: int) -> list[float]:
+def remaining_by_formula(g, degree):
     """p_l of E8.4, and what scaling leaves of a g below 0."""
     f = max(g, 0.0) ** (degree + 1)
     return [(g**ell - f) / (1 - f) for ell in range(degree + 1)]
 
 
-def factors_by_formula(g: float, rounds: int) -> list[float]:
+def factors_by_formula(g, rounds):
     """1 / (1 - nu) at Chebyshev's nodes nu (E7.1)."""
     bound = 0.9 * remaining_by_formula(g, 3)[2]
     return [1 / (1 - bound * math.cos((k + 0.5) * math.pi / rounds)) for k in range(rounds)]
 
 
-def round_by_loops(
-    problem: DiffusionProblem,
-    source: Tensor,
-    swept: Medium,
-    light: Tensor,
-    g: float,
-    degree: int,
-    directions: int,
-    is_last: bool,
-) -> Tensor:
+def round_by_loops(problem, source, swept, light, g, degree, directions, is_last):
     """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves.
 
     `swept` is the problem's medium with the means of cells.
@@ -204,7 +182,7 @@ def round_by_loops(
 has_flux_or_not = pytest.mark.parametrize("has_flux", [False, True])
 
 
-def gray_volume(shape: tuple[int, int, int], g: float, varies: bool = False) -> Volume:
+def gray_volume(shape, g, varies=False):
     """Half empty, up to 12 optical depths a unit; where it `varies`, sigma_s differs by cell."""
     density = half_empty(*shape)
     sigma_a, sigma_s = torch.tensor([[1.0], [11.0]], dtype=torch.float64)
@@ -213,11 +191,11 @@ def gray_volume(shape: tuple[int, int, int], g: float, varies: bool = False) -> 
     return Volume(box_grid(shape), density, sigma_a, sigma_s, density.new_tensor(g))
 
 
-def gray_medium(shape: tuple[int, int, int], g: float, varies: bool = False) -> Medium:
+def gray_medium(shape, g, varies=False):
     return scale_medium(gray_volume(shape, g, varies))
 
 
-def random_light(shape: tuple[int, int, int], degree: int) -> Tensor:
+def random_light(shape, degree):
     values = random_values((degree + 1) ** 2, 1, *shape, seed=1) - 0.5
     values[0] += 1.5
     return values
@@ -225,7 +203,7 @@ def random_light(shape: tuple[int, int, int], degree: int) -> Tensor:
 
 @has_flux_or_not
 @pytest.mark.parametrize("varies", [False, True])
-def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: bool):
+def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux, varies):
     shape, degree = (2, 3, 2), 3 * has_flux
     medium = gray_medium(shape, 0.4 * has_flux, varies)
     source = random_light(shape, degree)
@@ -242,14 +220,14 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
 
 @pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4), (1, 1, 6), (1, 1, 1)], ids=str)
-def test_the_share_of_a_change_is_that_of_the_mean_step(shape: tuple[int, int, int], g: float):
+def test_the_share_of_a_change_is_that_of_the_mean_step(shape, g):
     medium = gray_medium(shape, g)
     share = _transport_share(medium, _mean_step(medium.grid, 44))
     torch.testing.assert_close(share, share_by_loops(medium, 44), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
-def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
+def test_rounds_are_sweeps_by_loops_and_dense_solves(g):
     shape, degree = (2, 2, 3), 3 * (g != 0)
     volume = gray_volume(shape, g)
     medium = scale_medium(volume, 3)
@@ -288,7 +266,7 @@ DIRECTIONS = (
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("thickness", [1e-6, 1.0, 1e4])
-def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction: Direction, thickness: float):
+def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness):
     """Beside light that enters and would leave without a medium."""
     grid, room = box_grid((4, 5, 3)), tensor(0.7).view(1, 1, 1, 1)
     density = thickness * half_empty(4, 5, 3)

@@ -2,14 +2,11 @@
 
 import random
 import warnings
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from click.testing import Result
 
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.run import job
@@ -24,12 +21,11 @@ from ddrecon.run.job import (
 
 pytestmark = pytest.mark.slow
 
-Run = Callable[..., Result]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o", "out"]
 RESUME = [*OPTIMIZE, "--resume"]
 
 
-def flattened(value: Any) -> Iterator[Any]:
+def flattened(value):
     if isinstance(value, dict):
         for key, entry in value.items():
             yield key
@@ -41,18 +37,18 @@ def flattened(value: Any) -> Iterator[Any]:
         yield value.tolist() if isinstance(value, torch.Tensor) else value
 
 
-def density(folder: str = "out") -> np.ndarray:
+def density(folder="out"):
     with np.load(Path(folder, "volumes", "density.npz"), allow_pickle=False) as archive:
         return archive["density"]
 
 
-def iterations(folder: str = "out") -> list[int]:
+def iterations(folder="out"):
     return [
         int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
     ]
 
 
-def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
+def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
     states = [
         {"field": torch.rand(300), "text": "a text", "total": {"iteration": number}}
         for number in (1, 2)
@@ -73,7 +69,7 @@ def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) ->
     assert fallbacks > 20
 
 
-def test_a_log_with_lost_rows_is_told(run: Run) -> None:
+def test_a_log_with_lost_rows_is_told(run):
     """Whatever stands there instead of one, the rest is kept."""
     run(*OPTIMIZE, "--iterations", "4")
     log = Path("out/loss.csv")
@@ -94,7 +90,7 @@ CHANGES = {
 }
 
 
-def test_what_has_changed_is_named(run: Run, folder: Path) -> None:
+def test_what_has_changed_is_named(run, folder):
     run(*OPTIMIZE, "--iterations", "1")
     for change, difference in CHANGES.items():
         options = [change, "float64"] if change.startswith("-") else ["-D", change]
@@ -116,7 +112,7 @@ def test_few_of_many_differences_are_named():
     assert error.value.problems[-1] == f"other: {12 - MOST_CHANGES} more differ"
 
 
-def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
+def test_a_state_of_the_wrong_form_is_refused(run):
     run(*OPTIMIZE, "--iterations", "1")
     path = Path("out/checkpoints/last.pt")
     content = torch.load(path, weights_only=True)
@@ -129,12 +125,12 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
     )
 
 
-def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_are_written_along_the_way(run, monkeypatch):
     """As often as they are to be, unless they take more than their share of the time."""
     saved: list[int] = []
     original = job.save_checkpoint
 
-    def save(folder: Path, state: dict[str, Any], *scene: Any) -> None:
+    def save(folder, state, *scene):
         saved.append(state["frames"][0]["total"]["iteration"])
         original(folder, state, *scene)
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parent / "fault_runs.py"
 
 
-def test_no_fault_loses_anything(tmp_path: Path) -> None:
+def test_no_fault_loses_anything(tmp_path):
     """Of 4 signals two are SIGKILL, one SIGTERM and one Ctrl-C; twice there is no space."""
     found = subprocess.run(
         [sys.executable, SCRIPT, tmp_path, "4", "2"],

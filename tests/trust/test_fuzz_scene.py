@@ -113,7 +113,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def require_taken_or_refused(folder: Path, *arguments: str) -> int:
+def require_taken_or_refused(folder, *arguments):
     """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
     before = {*folder.rglob("*")}
     with deadline(5.0):

@@ -1,12 +1,10 @@
 """Memory is predicted; too much is refused with what would fit, and a shortage is one line."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from click.testing import Result
 
 from ddrecon import memory
 from ddrecon.cli.check import memory_estimate
@@ -14,7 +12,6 @@ from ddrecon.memory import Needs, explain_shortage, usable_cores
 from ddrecon.run import render_folder
 from ddrecon.scene_file.build import load_scene
 
-Run = Callable[..., Result]
 COMMANDS = {
     "render": ["render", "scene.yaml", "-o", "out"],
     "optimize": ["optimize", "scene.yaml", "-o", "out"],
@@ -28,7 +25,7 @@ LINE = (
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) -> None:
+def test_what_does_not_fit_is_refused_before_it_is_made(run, command):
     text = Path("scene.yaml").read_text()
     Path("scene.yaml").write_text(text.replace("[6, 5, 4]", "[1024, 1024, 1024]"))
     result = run(*COMMANDS[command])
@@ -36,16 +33,14 @@ def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) 
     assert not Path("out").exists()
 
 
-def test_too_many_pixels_are_refused_where_they_were_asked_for(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_pixels_are_refused_where_they_were_asked_for(run, monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda _: 60 * 2**20)
     result = run(*COMMANDS["render"], "--size", "9999", "9999")
     assert result.exit_code == 2
     assert result.stderr.startswith("--size 9999 9999: views: takes about ")
 
 
-def require_fit(run: Run, line: str, *command: str) -> None:
+def require_fit(run, line, *command):
     """Each of the proposals of a `line` about cells, made alone, takes no more than is free."""
     proposals = line.strip().partition("this would fit: ")[2].split(", or ")
     assert proposals
@@ -65,9 +60,7 @@ def require_fit(run: Run, line: str, *command: str) -> None:
     ],
     ids=str,
 )
-def test_what_is_said_to_fit_fits(
-    run: Run, monkeypatch: pytest.MonkeyPatch, change: list[str]
-) -> None:
+def test_what_is_said_to_fit_fits(run, monkeypatch, change):
     large = ["check", "scene.yaml", "-D", "volume.resolution=[96, 64, 64]", *change]
     monkeypatch.setattr(memory, "free_memory", lambda _: 60 * 2**20)
     result = run(*large)
@@ -76,9 +69,7 @@ def test_what_is_said_to_fit_fits(
 
 
 @pytest.mark.parametrize("part", [0.9, 0.3])
-def test_smaller_images_are_said_to_fit_where_cells_do(
-    monkeypatch: pytest.MonkeyPatch, part: float
-) -> None:
+def test_smaller_images_are_said_to_fit_where_cells_do(monkeypatch, part):
     needs = Needs((20, 20, 20), 40, 10**6, 4)
     monkeypatch.setattr(memory, "free_memory", lambda _: int(part * needs.total))
     line = memory.refuse_excess(needs, torch.device("cpu")) or ""
@@ -89,14 +80,14 @@ def test_smaller_images_are_said_to_fit_where_cells_do(
     assert fits[0] <= part * needs.total < fits[1]
 
 
-def write_group(folder: Path, files: dict[str, str]) -> None:
+def write_group(folder, files):
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         (folder / name).write_text(content + "\n")
 
 
 @pytest.fixture
-def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def groups(tmp_path, monkeypatch):
     """Has this process be in other control groups, as /proc/self/cgroup says it."""
     monkeypatch.setattr(memory, "GROUPS", tmp_path)
     monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
@@ -111,9 +102,7 @@ def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], N
         ("3:memory:/a/b\n1:cpu:/\n", "memory.limit_in_bytes", "rss 9\ntotal_rss 650"),
     ],
 )
-def test_limits_of_control_groups(
-    tmp_path: Path, groups: Callable[[str], None], own: str, limit: str, used: str
-) -> None:
+def test_limits_of_control_groups(tmp_path, groups, own, limit, used):
     """The least that a group, or one that it is in, has left; "max" is none."""
     cpu, top = torch.device("cpu"), tmp_path / ("memory" if "memory" in own else "")
     machine = memory.free_memory(cpu)
@@ -126,7 +115,7 @@ def test_limits_of_control_groups(
     assert memory.free_memory(cpu) == 50
 
 
-def test_cores_are_those_that_may_be_used(tmp_path: Path, groups: Callable[[str], None]) -> None:
+def test_cores_are_those_that_may_be_used(tmp_path, groups):
     """By affinity, and by the smallest quota of a group or of one that it is in."""
     groups("0::/a/b\n")
     assert usable_cores() == 8
@@ -149,11 +138,11 @@ CUDA = (
 )
 
 
-def ask_for_too_much() -> None:
+def ask_for_too_much():
     torch.empty(2**52)
 
 
-def fail_on_a_gpu() -> None:
+def fail_on_a_gpu():
     raise torch.cuda.OutOfMemoryError(CUDA)
 
 
@@ -161,9 +150,7 @@ def fail_on_a_gpu() -> None:
     ("shortage", "amount"),
     [(ask_for_too_much, "18014398509481984 bytes"), (fail_on_a_gpu, "2.00 GiB")],
 )
-def test_a_shortage_is_one_line_that_says_what_would_fit(
-    run: Run, monkeypatch: pytest.MonkeyPatch, shortage: Callable[[], None], amount: str
-) -> None:
+def test_a_shortage_is_one_line_that_says_what_would_fit(run, monkeypatch, shortage, amount):
     """That takes at most half of what was predicted, since more was needed."""
     monkeypatch.setattr(render_folder, "solve_light", lambda *_: shortage())
     result = run("render", "scene.yaml", "-q", "-o", "out", "--dtype", "float64")
@@ -176,7 +163,7 @@ def test_a_shortage_is_one_line_that_says_what_would_fit(
     require_fit(run, result.stderr.partition(", or images")[0], "check", "scene.yaml")
 
 
-def test_other_errors_are_no_shortage() -> None:
+def test_other_errors_are_no_shortage():
     with pytest.raises(RuntimeError) as caught:
         torch.ones(2) @ torch.ones(3)
     assert explain_shortage(caught.value) is None

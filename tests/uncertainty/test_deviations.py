@@ -1,7 +1,6 @@
 """Deviations by experiments: what is reconstructed next, and what follows of known errors."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 from media import make_camera, make_scene, random_values
-from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.picture import render
@@ -23,11 +21,11 @@ SHAPE = (12, 14, 10)
 GRID = Grid(SHAPE, (0.0, 0.0, 0.0), (1.2, 1.4, 1.0))
 
 
-def parameter_of(name: str, value: Tensor) -> Parameter:
+def parameter_of(name, value):
     return Parameter(name, ParameterSettings(), value, GRID)
 
 
-def found_of(values: dict[str, Tensor]) -> Uncertainty:
+def found_of(values):
     """What a run has found, `values`, before any experiment."""
     found: Any = Uncertainty.__new__(Uncertainty)
     found.parameters = [parameter_of(name, value) for name, value in values.items()]
@@ -37,7 +35,7 @@ def found_of(values: dict[str, Tensor]) -> Uncertainty:
     return found
 
 
-def finished_run(noise: NoiseSettings | None = None) -> Reconstruction:
+def finished_run(noise=None):
     """One iteration from two pictures, an eighth off, of a medium that scatters many times."""
     eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
     rounds = {"transport_rounds": 1, "tolerance": 1e-6}
@@ -53,7 +51,7 @@ def finished_run(noise: NoiseSettings | None = None) -> Reconstruction:
     return run
 
 
-def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does() -> None:
+def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does():
     """By what the run leaves, or by noise that is known; at first the other way around."""
     scene = finished_run().current_scene()
     diffusion = scene.diffusion
@@ -73,21 +71,17 @@ def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does(
                 assert min(errors) < 0.3 * min(wrong, float(left.abs().mean()))
 
 
-def reconstruct_by(
-    found: Uncertainty, method: Callable[[Tensor], Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def reconstruct_by(found, method, monkeypatch):
     """Has experiments of `found` end in one step, by this `method` of each of their truths."""
 
-    def begin() -> Any:
+    def begin():
         ended = [parameter_of(name, method(truth)) for name, truth in found.truth.items()]
         return SimpleNamespace(parameters=ended, step=lambda: None, is_done=True, iteration=1)
 
     monkeypatch.setattr(found, "_begin", begin)
 
 
-def test_the_next_volume_gets_back_what_a_linear_method_loses(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_next_volume_gets_back_what_a_linear_method_loses(monkeypatch):
     """A method that keeps a part s of everything: truths are found (1 - (1 - s)^k) / s of all."""
     value, part = 1 + random_values(*SHAPE), 0.4
     found = found_of({"density": value})
@@ -101,9 +95,7 @@ def test_the_next_volume_gets_back_what_a_linear_method_loses(
         torch.testing.assert_close(found.truth["density"], truth)
 
 
-def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(monkeypatch):
     value = random_values(*SHAPE) - 0.5
     found = found_of({"density": value.clamp(min=0), "g": torch.tensor(0.3, dtype=torch.float64)})
     reconstruct_by(found, lambda truth: truth + 0.2, monkeypatch)
@@ -118,9 +110,7 @@ def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(
     assert mass["deviation"] == pytest.approx(RATIO * 3 * 0.2 * volume)
 
 
-def test_a_deviation_is_the_root_mean_square_of_the_errors_around_less_what_experiments_lack() -> (
-    None
-):
+def test_a_deviation_is_the_root_mean_square_of_the_errors_around_less_what_experiments_lack():
     """So two thirds of normal errors are within it, by whichever experiments."""
     torch.manual_seed(1)
     value = torch.zeros(SHAPE).double()

@@ -1,14 +1,12 @@
 """The hard cases keep their bounds, and broken ones are told; so is what a bench measures."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
-from click.testing import Result
 
 from ddrecon import bench
 from ddrecon.bench import (
@@ -30,7 +28,6 @@ from ddrecon.errors import MissingExtraError
 from ddrecon.picture import render
 from ddrecon.reference.trace import Traced
 
-Run = Callable[..., Result]
 CPU = torch.device("cpu")
 SMALL = HardCase(torch.ones, shape=(4, 5, 6), g=0.4)
 BROKEN = [
@@ -46,25 +43,25 @@ BROKEN = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_a_hard_case_keeps_its_bounds(name: str):
+def test_a_hard_case_keeps_its_bounds(name):
     report = run_case(CASES[name], CPU)
     assert report["failures"] == [], report
 
 
 @pytest.mark.parametrize(("numbers", "failures"), BROKEN)
-def test_each_broken_bound_is_told(numbers: dict[str, float], failures: list[str]):
+def test_each_broken_bound_is_told(numbers, failures):
     """And no bound that is kept: residuals may be what rounding makes of them."""
     assert find_failures(dict.fromkeys(bench.NUMBERS, 0.0) | numbers) == failures
 
 
-def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
+def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch):
     name, lighting = "g -0.99, density jumps by 1e6", import_module("ddrecon.lighting")
     monkeypatch.setattr(lighting, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
     assert run_case(CASES[name], CPU)["failures"] == ["radiance"]
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.5])
-def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
+def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient):
     """All it has too much of is absorbed or leaks; with g not 0, a little is none of its own."""
     scene, memory = replace(SMALL, ambient=ambient).scene(torch.float64, CPU), SolveMemory()
     render(scene, memory=memory)
@@ -75,7 +72,7 @@ def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
 
 
 @pytest.mark.slow
-def test_hard_cases_pass_unless_a_solve_gives_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hard_cases_pass_unless_a_solve_gives_up(run, monkeypatch):
     monkeypatch.setattr(bench, "CASES", {"vacuum": HardCase(torch.zeros), "small": SMALL})
     result = run("bench", "--hard", "-q", "-o", "out", "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -90,11 +87,11 @@ def test_hard_cases_pass_unless_a_solve_gives_up(run: Run, monkeypatch: pytest.M
     assert "FAIL: " in row and "did not reach" in row
 
 
-def test_the_gradient_is_the_slope_of_the_mean_of_the_image() -> None:
+def test_the_gradient_is_the_slope_of_the_mean_of_the_image():
     """Along density itself, by a central difference."""
     plume = bench.plume_scene(8, 4, torch.float64, CPU)
 
-    def mean(factor: float) -> float:
+    def mean(factor):
         volume = replace(plume.volume, density=factor * plume.volume.density)
         return float(shoot(replace(plume, volume=volume)).image.mean())
 
@@ -102,14 +99,14 @@ def test_the_gradient_is_the_slope_of_the_mean_of_the_image() -> None:
     assert float(along) == pytest.approx((mean(1.0001) - mean(0.9999)) / 0.0002, rel=1e-4)
 
 
-def test_the_best_are_those_that_no_other_beats_in_both_time_and_error() -> None:
+def test_the_best_are_those_that_no_other_beats_in_both_time_and_error():
     known = {"a": (1, 0.3), "b": (2, 0.4), "c": (3, 0.1), "d": (4, 0.1), "e": (5, 0.05)}
     rows = [{"name": n, "image_seconds": t, "image_error": e} for n, (t, e) in known.items()]
     mark_best(rows, 0.0)
     assert [row["name"] for row in rows if row["best"]] == ["a", "c", "e"]
 
 
-def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
+def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides():
     image = torch.ones(3, 2, 2)
     truth = Traced(image.numpy(), 0.09)
     known = {"base": (1.02, 1.0), "slower": (1.0, 2.0), "Mitsuba 16 paths a pixel": (1.3, 72.0)}
@@ -124,10 +121,8 @@ def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("has_mitsuba", [False, True])
-def test_a_scene_is_measured_by_every_variant(
-    run: Run, monkeypatch: pytest.MonkeyPatch, has_mitsuba: bool
-) -> None:
-    def refuse(*_: object, **__: object) -> None:
+def test_a_scene_is_measured_by_every_variant(run, monkeypatch, has_mitsuba):
+    def refuse(*_, **__):
         raise MissingExtraError("no Mitsuba here")
 
     if has_mitsuba:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -27,9 +26,7 @@ NAMES = tuple(load_scene(CONFIG).starts)
 ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 
 
-def check(
-    name: str, samples: int = 0, overrides: tuple[str, ...] = ONE_ROUND
-) -> list[dict[str, Any]]:
+def check(name, samples=0, overrides=ONE_ROUND):
     """Of one view, above a ground for its number alone, under the light whose number it is."""
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
     seen = name.split(".")[1] if name.startswith("views.") else "front"
@@ -63,7 +60,7 @@ def test_every_parameter_passes(name, overrides):
     assert overrides is WHITE or any(entry["adjoint"] != 0 for entry in result["entries"])
 
 
-def test_all_at_once_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_at_once_pass(monkeypatch):
     overrides = [*SMALL, "diffusion.transport_rounds=1"]
     scene = load_scene(CONFIG, overrides=overrides, dtype=torch.float64)
     # None of them alone: `test_every_parameter_passes` checks those.
@@ -73,14 +70,14 @@ def test_all_at_once_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result["passed"], result
 
 
-def test_density_passes_in_empty_cells_as_well() -> None:
+def test_density_passes_in_empty_cells_as_well():
     (result,) = check("density", samples=4)
     assert result["passed"], result
     values = [e["value"] for e in result["entries"] if e["value"] is not None]
     assert {value == 0 for value in values} == {True, False}
 
 
-def test_rays_and_beams_along_the_axes_of_the_lattice_pass() -> None:
+def test_rays_and_beams_along_the_axes_of_the_lattice_pass():
     """Through centers of cells, where differences are not what a slope to one side is."""
     camera = make_camera((0.0, 0.0, 3.0), (9, 7), is_perspective=False)
     grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
@@ -90,7 +87,7 @@ def test_rays_and_beams_along_the_axes_of_the_lattice_pass() -> None:
         assert result["passed"], result
 
 
-def test_an_unknown_parameter_is_refused() -> None:
+def test_an_unknown_parameter_is_refused():
     with pytest.raises(UsageError, match=r"no such number; did you mean 'density'"):
         check("densty")
 
@@ -102,14 +99,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_derivative_one_percent_off_is_caught(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+def test_a_derivative_one_percent_off_is_caught(monkeypatch, case):
     owner, mode, parameter = BROKEN[case]
     right = getattr(owner, mode)
     monkeypatch.setattr(owner, mode, staticmethod(lambda *arguments: _off(right(*arguments))))
     assert issubclass(owner, Function) and not check(parameter)[0]["passed"]
 
 
-def _off(result: object) -> object:
+def _off(result):
     if isinstance(result, tuple):
         return tuple(_off(entry) for entry in result)
     return 1.01 * result if isinstance(result, torch.Tensor) else result

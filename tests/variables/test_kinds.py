@@ -8,7 +8,7 @@ from media import make_scene
 
 from ddrecon.picture import render
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import KINDS, kind_of, pattern_of
@@ -30,7 +30,7 @@ PHASES = {"phase.g": LOBES, "phase.weight": LOBES, "media.NAME.g": MEDIA}
 
 
 @pytest.fixture(scope="module")
-def scenes() -> dict[str, Scene]:
+def scenes():
     """Scenes with every kind of light, in which all kinds of variables occur, by phase function."""
     phases = {"": ["volume.g=0.3"]}
     others = ["volume.g=0", "optimize="]
@@ -42,17 +42,17 @@ def scenes() -> dict[str, Scene]:
 
 
 @pytest.fixture
-def scene(scenes: dict[str, Scene], request: pytest.FixtureRequest) -> Scene:
+def scene(scenes, request):
     """The one that has a variable of the kind in question."""
     return scenes[PHASES.get(request.node.callspec.params["pattern"], "")]
 
 
-def name_of(pattern: str, scene: Scene) -> str:
+def name_of(pattern, scene):
     """The last variable of `scene` that follows `pattern`: of lights, the one with colors."""
     return [name for name in variable_names(scene) if pattern_of(name) == pattern][-1]
 
 
-def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes: dict[str, Scene]) -> None:
+def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes):
     names = [name for scene in scenes.values() for name in variable_names(scene)]
     assert {pattern_of(name) for name in names} == set(KINDS)
 
@@ -82,7 +82,7 @@ def test_a_kind_is_settable_alone_and_differentiable(scene, pattern):
 
 
 @pytest.mark.parametrize("pattern", KINDS)
-def test_values_are_within_bounds_and_stay_there_as_they_move(scene: Scene, pattern: str) -> None:
+def test_values_are_within_bounds_and_stay_there_as_they_move(scene, pattern):
     kind, name = KINDS[pattern], name_of(pattern, scene)
     value = value_of(scene, name)
     assert kind.low < kind.high and bool((value >= kind.low).all() and (value <= kind.high).all())
@@ -100,7 +100,7 @@ def test_values_are_within_bounds_and_stay_there_as_they_move(scene: Scene, patt
 
 
 @pytest.mark.parametrize("pattern", KINDS)
-def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -> None:
+def test_the_axes_of_a_value_are_those_of_its_kind(scene, pattern):
     kind, name = KINDS[pattern], name_of(pattern, scene)
     value, cells = value_of(scene, name), scene.volume.grid.shape
     components = component_names(name, value)
@@ -113,7 +113,7 @@ def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -
 
 
 @pytest.mark.parametrize("name", ["emission", "views.front.offset"])
-def test_what_masked_pixels_hold_leaves_changes_alone(name: str) -> None:
+def test_what_masked_pixels_hold_leaves_changes_alone(name):
     changes = []
     for lamp in (0.0, 1000.0):
         scene = make_scene(torch.ones(2, 2, 2), emission=torch.zeros(1))

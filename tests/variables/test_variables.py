@@ -7,21 +7,19 @@ from media import make_scene, random_values
 from ddrecon.cameras import Camera, look_at
 from ddrecon.errors import UsageError
 from ddrecon.picture import render
-from ddrecon.scene import Scene, View
+from ddrecon.scene import View
 from ddrecon.variables.values import name_each, value_of, variation, with_values
 
 SHAPE = (4, 3, 5)
 
 
 @pytest.fixture
-def scene() -> Scene:
+def scene():
     return make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
 
 
 @pytest.mark.parametrize("is_field", [True, False])
-def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
-    scene: Scene, is_field: bool
-) -> None:
+def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(scene, is_field):
     shape = (3, *SHAPE) if is_field else (3,)
     known = {"sigma_a": random_values(*shape), "sigma_s": 5 * random_values(*shape, seed=1)}
     changed = with_values(scene, known)
@@ -30,20 +28,20 @@ def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
         torch.testing.assert_close(value_of(again, name), value, rtol=1e-13, atol=1e-15)
 
 
-def test_a_field_and_a_constant_mix(scene: Scene) -> None:
+def test_a_field_and_a_constant_mix(scene):
     albedo, sigma_t = random_values(3, *SHAPE), torch.tensor([4.0, 5.0, 6.0], dtype=torch.float64)
     changed = with_values(scene, {"albedo": albedo, "sigma_t": sigma_t})
     torch.testing.assert_close(changed.volume.sigma_s, albedo * sigma_t.view(3, 1, 1, 1))
     assert torch.isfinite(render(changed)).all()
 
 
-def test_the_albedo_of_nothing_is_nothing(scene: Scene) -> None:
+def test_the_albedo_of_nothing_is_nothing(scene):
     nothing = torch.zeros(3, dtype=torch.float64)
     empty = with_values(scene, {"sigma_a": nothing, "sigma_s": nothing})
     assert torch.equal(value_of(empty, "albedo"), nothing)
 
 
-def test_one_density_fills_the_grid(scene: Scene) -> None:
+def test_one_density_fills_the_grid(scene):
     changed = with_values(scene, {"density": torch.tensor(0.5, dtype=torch.float64)})
     assert changed.volume.density.shape == SHAPE and bool((changed.volume.density == 0.5).all())
 
@@ -52,7 +50,7 @@ ABSENT = ["depth", "lights.2.radiance", "lights.0.radiance", "lights.x.radiance"
 
 
 @pytest.mark.parametrize("name", [*ABSENT, "views.none.camera", "views.view"])
-def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
+def test_what_a_scene_does_not_have_is_refused(scene, name):
     with pytest.raises(UsageError):
         value_of(scene, name)
     with pytest.raises(UsageError):
@@ -69,19 +67,19 @@ def test_what_varies_is_a_variable_or_a_component_of_one(scene):
             variation(scene, name)
 
 
-def view(name: str, is_test: bool = False, has_image: bool = True) -> View:
+def view(name, is_test=False, has_image=True):
     pose = look_at(*torch.tensor([[0.0, 0, 5], [0, 0, 0], [0, 1, 0]]))
     image = torch.zeros(3, 2, 2) if has_image else None
     return View(name, Camera(pose, (2, 2), 0.3), image, is_test=is_test)
 
 
-def test_a_star_is_every_training_view_with_an_image() -> None:
+def test_a_star_is_every_training_view_with_an_image():
     views = [view("a"), view("b.c"), view("held", is_test=True), view("d", has_image=False)]
     named = name_each({"density": 1, "views.*.exposure": 2}, views)
     assert named == {"density": 1, "views.a.exposure": 2, "views.b.c.exposure": 2}
 
 
-def test_the_settings_of_a_view_itself_win() -> None:
+def test_the_settings_of_a_view_itself_win():
     views, pairs = [view("a"), view("b")], [("views.*.camera", 1), ("views.b.camera", 2)]
     for parameters in (pairs, pairs[::-1]):
         named = name_each(dict(parameters), views)

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from itertools import permutations
-from pathlib import Path
 
 import pytest
 
@@ -24,7 +23,7 @@ from ddrecon.io.files.folders import (
 )
 
 
-def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: Path):
+def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path):
     path = tmp_path / "a.txt"
     with replace_file(path) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".txt" and temporary != path
@@ -34,9 +33,7 @@ def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: P
 
 
 @pytest.mark.parametrize("interruption", [ValueError, KeyboardInterrupt])
-def test_an_interrupted_write_leaves_the_old_file(
-    tmp_path: Path, interruption: type[BaseException]
-):
+def test_an_interrupted_write_leaves_the_old_file(tmp_path, interruption):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(interruption), replace_file(path) as temporary:
@@ -46,18 +43,16 @@ def test_an_interrupted_write_leaves_the_old_file(
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-def test_the_file_is_there_all_the_while_it_is_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
-) -> None:
+def test_the_file_is_there_all_the_while_it_is_replaced(tmp_path, monkeypatch, has_links):
     """Whole at each step a crash may come after, what it was before is kept, and none is left."""
     path, kept = tmp_path / "a.txt", tmp_path / "before.txt"
     replace, seen = os.replace, []
 
-    def look(source: Path, target: Path) -> None:
+    def look(source, target):
         replace(source, target)
         seen.append(path.read_text())
 
-    def link(*_: Path) -> None:
+    def link(*_):
         raise PermissionError
 
     monkeypatch.setattr(os, "replace", look)
@@ -70,19 +65,17 @@ def test_the_file_is_there_all_the_while_it_is_replaced(
     assert kept.read_text() == "2" and sorted(tmp_path.iterdir()) == [path, kept]
 
 
-def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
+def test_a_refusal_of_the_system_is_a_format_error(tmp_path):
     path = tmp_path / "absent" / "a.txt"
     with pytest.raises(FormatError, match="cannot be written"), replace_file(path) as temporary:
         temporary.write_text("x")
 
 
-def test_folders_that_cannot_be_flushed_hold_checkpoints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_that_cannot_be_flushed_hold_checkpoints(tmp_path, monkeypatch):
     """As Windows and some network drives have them."""
     opened = os.open
 
-    def refuse(path: Path, *rest: int, **others: int) -> int:
+    def refuse(path, *rest, **others):
         if os.path.isdir(path):
             raise PermissionError
         return opened(path, *rest, **others)
@@ -103,7 +96,7 @@ folder = Path(sys.argv[1])
 HOLD = SCRIPT + "with claim_folder(folder, 'run', overwrite=True): exec(sys.argv[2])"
 
 
-def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path: Path) -> None:
+def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path):
     command = [sys.executable, "-c", HOLD, tmp_path, "print('in', flush=True); input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
         assert first.stdout is not None and first.stdout.readline() == b"in\n"
@@ -118,7 +111,7 @@ def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_nobody_holds_blocks_nobody(tmp_path: Path) -> None:
+def test_what_nobody_holds_blocks_nobody(tmp_path):
     """A killed process's lock among it."""
     command = [sys.executable, "-c", HOLD, tmp_path, "os.kill(os.getpid(), 9)"]
     assert subprocess.run(command).returncode == -9
@@ -131,13 +124,13 @@ def test_what_nobody_holds_blocks_nobody(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_locked_is_refused(tmp_path, monkeypatch):
     (tmp_path / LOCK).mkdir()
     with pytest.raises(UsageError, match=f"{LOCK}: cannot be locked: Is a directory"):
         claim_folder(tmp_path, "run", overwrite=True).__enter__()
     (tmp_path / LOCK).rmdir()
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
     monkeypatch.setattr("fcntl.flock", refuse)
@@ -145,7 +138,7 @@ def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
         claim_folder(tmp_path, "run", overwrite=True).__enter__()
 
 
-def test_files_are_written_into_folders_and_over_nothing_unasked(tmp_path: Path) -> None:
+def test_files_are_written_into_folders_and_over_nothing_unasked(tmp_path):
     paths = [tmp_path / name for name in ("one", "two", "three")]
     for path in paths[1:]:
         path.touch()
@@ -157,7 +150,7 @@ def test_files_are_written_into_folders_and_over_nothing_unasked(tmp_path: Path)
             require_free_files([tmp_path / folder / "one"], may_exist=True)
 
 
-def fill(path: Path, kind: str, *names: str) -> None:
+def fill(path, kind, *names):
     """Has a job of a `kind` write files of these `names` in `path`."""
     with claim_folder(path, kind, overwrite=True):
         for name in names:
@@ -165,12 +158,12 @@ def fill(path: Path, kind: str, *names: str) -> None:
             write_json(path / name, name)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     paths = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-def test_what_is_removed_is_what_was_written(tmp_path: Path) -> None:
+def test_what_is_removed_is_what_was_written(tmp_path):
     fill(tmp_path, RUN, "a", "deep/er/b", "deep/c", "kept")
     fill(tmp_path, RUN, "later")  # the manifest grows
     (tmp_path / "deep/mine").write_text("mine")
@@ -184,7 +177,7 @@ def test_what_is_removed_is_what_was_written(tmp_path: Path) -> None:
     assert set(contents(tmp_path)) == {MANIFEST, "deep/mine"}
 
 
-def assert_refused(path: Path, kind: str, text: str, *ways: dict[str, bool]) -> None:
+def assert_refused(path, kind, text, *ways):
     """No job of this `kind` begins in the folder `path`, in whatever way, and nothing changes."""
     before = contents(path)
     for way in ways:
@@ -194,13 +187,13 @@ def assert_refused(path: Path, kind: str, text: str, *ways: dict[str, bool]) -> 
 
 
 @pytest.mark.parametrize(("there", "kind"), [*permutations(KINDS, 2)])
-def test_a_folder_of_another_kind_is_refused(tmp_path: Path, there: str, kind: str) -> None:
+def test_a_folder_of_another_kind_is_refused(tmp_path, there, kind):
     fill(tmp_path, there, "report.html")
     text = f"another kind of job, {there}; choose another folder"
     assert_refused(tmp_path, kind, text, {"overwrite": True}, {"resume": True}, {})
 
 
-def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_others_is_refused(tmp_path):
     (tmp_path / "scene.yaml").write_text("mine")
     (tmp_path / MANIFEST).write_text("ddrecon strange\nscene.yaml\n")
     assert_refused(tmp_path, RUN, "holds scene.yaml, which ddrecon did not", {})
@@ -209,7 +202,7 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_a_folder_whose_manifest_is_lost_goes_on_as_the_refusal_says(tmp_path: Path) -> None:
+def test_a_folder_whose_manifest_is_lost_goes_on_as_the_refusal_says(tmp_path):
     fill(tmp_path, RUN, "a")
     (tmp_path / MANIFEST).unlink()
     with pytest.raises(UsageError) as refused, claim_folder(tmp_path, RUN, resume=True):
@@ -220,7 +213,7 @@ def test_a_folder_whose_manifest_is_lost_goes_on_as_the_refusal_says(tmp_path: P
     assert (tmp_path / "a").is_file()
 
 
-def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
+def test_a_manifest_names_nothing_outside(tmp_path):
     secret = tmp_path / "secret"
     secret.write_text("mine")
     fill(tmp_path / "run", RUN, "a")
@@ -231,7 +224,7 @@ def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"secret": b"mine"}
 
 
-def test_a_file_of_others_steps_aside(tmp_path: Path) -> None:
+def test_a_file_of_others_steps_aside(tmp_path):
     """Where a job comes to write one of its name, amid its own."""
     fill(tmp_path, RUN, "a")
     for number in (1, 2):
@@ -242,7 +235,7 @@ def test_a_file_of_others_steps_aside(tmp_path: Path) -> None:
         assert (tmp_path / f"report.{number}.html").read_text() == str(number)
 
 
-def test_folders_within_are_removed_by_part(tmp_path: Path) -> None:
+def test_folders_within_are_removed_by_part(tmp_path):
     """By their own manifests, and none of them while another process writes to one."""
     with claim_folder(tmp_path, FILM):
         write_json(tmp_path / "film.json", 0)
@@ -269,7 +262,7 @@ def test_folders_within_are_removed_by_part(tmp_path: Path) -> None:
     }
 
 
-def test_where_nothing_was_written_no_folder_is_left(tmp_path: Path) -> None:
+def test_where_nothing_was_written_no_folder_is_left(tmp_path):
     with pytest.raises(ZeroDivisionError), claim_folder(tmp_path / "a/b", RUN):
         raise ZeroDivisionError
     assert not any(tmp_path.iterdir())

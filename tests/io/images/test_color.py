@@ -3,7 +3,6 @@
 import struct
 import warnings
 import zlib
-from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -13,15 +12,15 @@ from PIL import Image as Pillow
 from refusals import image_refusal
 
 from ddrecon.errors import DataWarning
-from ddrecon.io.images.table import Image, read_image
+from ddrecon.io.images.table import read_image
 from ddrecon.pictures import decode
 
 
-def iccp(profile: bytes) -> bytes:
+def iccp(profile):
     return b"any\0\0" + zlib.compress(profile)
 
 
-def gama(value: float) -> bytes:
+def gama(value):
     return struct.pack(">I", round(1e5 * value))
 
 
@@ -29,11 +28,11 @@ SRGB = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 DISPLAY_P3 = (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
 
 
-def chrm(values: tuple[float, ...]) -> bytes:
+def chrm(values):
     return struct.pack(">8I", *(round(1e5 * value) for value in values))
 
 
-def read_silently(path: Path) -> Image:
+def read_silently(path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return read_image(path)
@@ -70,9 +69,7 @@ REFUSED = {
 @pytest.mark.parametrize("kind", [0, 2, 4, 6])
 @pytest.mark.parametrize("depth", [8, 16])
 @pytest.mark.parametrize("said", [*(("linear", each) for each in AS_LINEAR), *AS_SRGB])
-def test_the_curve_that_a_png_names_is_the_one_that_decodes_it(
-    tmp_path: Path, said: str | tuple[str, str], depth: int, kind: int
-) -> None:
+def test_the_curve_that_a_png_names_is_the_one_that_decodes_it(tmp_path, said, depth, kind):
     """`step` is that of sRGB, by which displayed values are compared."""
     if depth == 16 and kind:
         pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
@@ -87,14 +84,14 @@ def test_the_curve_that_a_png_names_is_the_one_that_decodes_it(
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_other_curves_are_refused_by_name(tmp_path: Path, case: str) -> None:
+def test_other_curves_are_refused_by_name(tmp_path, case):
     chunks, named = REFUSED[case]
     path = write_png(tmp_path / "a.png", np.full((2, 2, 3), 128), **chunks)
     assert f"is encoded by another curve than sRGB's, by its {named}" in image_refusal(path)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".png"])
-def test_a_profile_counts_in_every_format(tmp_path: Path, suffix: str) -> None:
+def test_a_profile_counts_in_every_format(tmp_path, suffix):
     """Its own primaries are said, its own curve is refused."""
     stored = Pillow.new("RGB", (16, 16), (200, 200, 200))
     plain, other, wide = (tmp_path / f"{name}{suffix}" for name in ("plain", "other", "wide"))
@@ -109,14 +106,14 @@ def test_a_profile_counts_in_every_format(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("said", [{"cHRM": chrm(DISPLAY_P3)}, {"cICP": bytes([12, 13, 0, 1])}])
-def test_other_primaries_are_said_and_colors_taken(tmp_path: Path, said: dict[str, bytes]) -> None:
+def test_other_primaries_are_said_and_colors_taken(tmp_path, said):
     samples = np.full((2, 2, 3), (200, 100, 50))
     with pytest.warns(DataWarning, match=r"\*\.png: .*primaries other than sRGB's"):
         image = read_image(write_png(tmp_path / "a.png", samples, **said))
     assert np.allclose(image.pixels, decode(samples / 255), atol=1e-6)
 
 
-def test_chromaticities_of_exr_are_said(tmp_path: Path) -> None:
+def test_chromaticities_of_exr_are_said(tmp_path):
     pixels = np.random.default_rng(0).random((2, 3, 3), np.float32)
     for values, is_said in ((SRGB, False), (DISPLAY_P3, True)):
         path = tmp_path / f"{is_said}.exr"
@@ -128,9 +125,7 @@ def test_chromaticities_of_exr_are_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".png"])
-def test_turned_pictures_are_taken_as_stored_and_said_once_a_folder(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_turned_pictures_are_taken_as_stored_and_said_once_a_folder(tmp_path, suffix):
     stored = np.zeros((16, 32, 3), np.uint8)
     stored[:8, :8] = 255
     exif = Pillow.Exif()
@@ -146,7 +141,7 @@ def test_turned_pictures_are_taken_as_stored_and_said_once_a_folder(
     assert len(told) == 1 and str(tmp_path / f"*{suffix}") in told.pop()
 
 
-def test_a_camera_that_says_adobe_rgb_by_exif_alone_is_refused(tmp_path: Path) -> None:
+def test_a_camera_that_says_adobe_rgb_by_exif_alone_is_refused(tmp_path):
     exif = Pillow.Exif()
     exif[0x8769] = {0xA001: 65535, 0xA005: {1: "R03"}}
     Pillow.new("RGB", (16, 16)).save(tmp_path / "a.jpg", exif=exif)
@@ -156,7 +151,7 @@ def test_a_camera_that_says_adobe_rgb_by_exif_alone_is_refused(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("curve", "is_legal"), [("arib-std-b67", False), ("smpte2084", False), ("bt709", True)]
 )
-def test_films_of_other_curves_are_refused(tmp_path: Path, curve: str, is_legal: bool) -> None:
+def test_films_of_other_curves_are_refused(tmp_path, curve, is_legal):
     pytest.importorskip("imageio_ffmpeg", reason="films are an extra")
     tags = ["-vf", f"setparams=color_primaries=bt709:color_trc={curve}"]
     form = {"codec": "libx264", "macro_block_size": 1, "pixelformat": "yuv444p"}

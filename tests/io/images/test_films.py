@@ -1,7 +1,5 @@
 """The frame of a film that is asked for is the one that is read, or there is a line."""
 
-from pathlib import Path
-
 import pytest
 from film_files import H264, ffmpeg, number_of, write_film
 
@@ -23,12 +21,12 @@ KINDS: dict[str, tuple[str, str, tuple[str, ...], str]] = {
 }
 
 
-def shown(path: Path, number: int, time: float = 0.0) -> int:
+def shown(path, number, time=0.0):
     return number_of(read_image(path, number, time).pixels)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_frame_that_is_asked_for_is_read(tmp_path: Path, kind: str) -> None:
+def test_the_frame_that_is_asked_for_is_read(tmp_path, kind):
     suffix, rate, options, shift = KINDS[kind]
     path = tmp_path / f"film{suffix}"
     write_film(path, COUNT, rate, *options, shift=shift)
@@ -39,7 +37,7 @@ def test_the_frame_that_is_asked_for_is_read(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-def test_what_was_cut_off_is_not_counted(tmp_path: Path, suffix: str) -> None:
+def test_what_was_cut_off_is_not_counted(tmp_path, suffix):
     """A cut without encoding keeps what its first frame is decoded from, or begins there."""
     whole, part = tmp_path / "whole.mp4", tmp_path / f"part{suffix}"
     write_film(whole, COUNT, "25", *H264)
@@ -49,7 +47,7 @@ def test_what_was_cut_off_is_not_counted(tmp_path: Path, suffix: str) -> None:
     assert [shown(part, number) for number in (0, 1, 70)] == [first, first + 1, first + 70]
 
 
-def test_frames_are_counted_from_the_one_nearest_to_a_time(tmp_path: Path) -> None:
+def test_frames_are_counted_from_the_one_nearest_to_a_time(tmp_path):
     path = tmp_path / "film.mp4"
     write_film(path, 60, "30", *H264, shift="gte(N,30)*60")
     times = frame_times(path)
@@ -58,7 +56,7 @@ def test_frames_are_counted_from_the_one_nearest_to_a_time(tmp_path: Path) -> No
         assert shown(path, 0, time) == number and shown(path, 5, time) == number + 5
 
 
-def test_a_film_is_read_as_it_is_held(tmp_path: Path) -> None:
+def test_a_film_is_read_as_it_is_held(tmp_path):
     """Turned as telephones turn theirs, and without the picture of its cover."""
     film, turned, red = (tmp_path / name for name in ("film.mp4", "turned.mp4", "red.png"))
     write_film(film, 4, "25", *H264)
@@ -69,7 +67,7 @@ def test_a_film_is_read_as_it_is_held(tmp_path: Path) -> None:
     assert pixels.shape == (32, 16, 3) and number_of(pixels.swapaxes(0, 1)[:, ::-1]) == 3
 
 
-def test_a_damaged_frame_is_refused(tmp_path: Path) -> None:
+def test_a_damaged_frame_is_refused(tmp_path):
     path = tmp_path / "film.mkv"
     write_film(path, 9, "25", "-c:v", "png")
     half, content = path.stat().st_size // 2, bytearray(path.read_bytes())
@@ -88,7 +86,7 @@ def test_a_damaged_frame_is_refused(tmp_path: Path) -> None:
         (".webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
     ],
 )
-def test_films_with_alpha_are_refused(tmp_path: Path, suffix: str, options: tuple[str]) -> None:
+def test_films_with_alpha_are_refused(tmp_path, suffix, options):
     """It would be lost: what is transparent would be as bright as what is not."""
     path = tmp_path / f"film{suffix}"
     ffmpeg("-f", "lavfi", "-i", "color=red@0.5:s=32x16:d=0.2,format=rgba", *options, path)

@@ -4,8 +4,6 @@ Of an EXR the one part and the channels that are a picture are read, whatever el
 Radiance pictures, flat and run-length encoded ones come back to rounding. A TIFF holds floats.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from image_files import icc_profile, write_exr, write_parts
@@ -19,7 +17,7 @@ tifffile = pytest.importorskip("tifffile")
 RNG = np.random.default_rng(0)
 
 
-def part(names: str, dtype: str = "f4") -> tuple[list[str], np.ndarray]:
+def part(names, dtype="f4"):
     """Channels by their `names`, with random values."""
     channels = names.split()
     return channels, (9 * RNG.random((3, 5, len(channels)))).astype(dtype)
@@ -37,9 +35,7 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("names", ["R G B A", "R G B", "Y", "Y A"])
 @pytest.mark.parametrize("is_first", [True, False])
-def test_the_part_that_is_a_picture_is_read(
-    tmp_path: Path, other: str, names: str, is_first: bool
-) -> None:
+def test_the_part_that_is_a_picture_is_read(tmp_path, other, names, is_first):
     picture = part(names)
     parts = {"beauty": picture, other: OTHERS[other]}
     order = dict(reversed(parts.items())) if is_first else parts
@@ -52,7 +48,7 @@ def test_the_part_that_is_a_picture_is_read(
 
 
 @pytest.mark.parametrize("other", OTHERS)
-def test_other_channels_beside_colors_are_left_out(tmp_path: Path, other: str) -> None:
+def test_other_channels_beside_colors_are_left_out(tmp_path, other):
     """But an A, which is alpha."""
     names, values = part("R G B")
     others, more = OTHERS[other]
@@ -66,9 +62,7 @@ NO_PICTURE += ["beauty.R beauty.G beauty.B", "diffuse.R diffuse.G diffuse.B Z"]
 
 
 @pytest.mark.parametrize("names", NO_PICTURE)
-def test_channels_that_are_no_picture_are_refused_by_their_names(
-    tmp_path: Path, names: str
-) -> None:
+def test_channels_that_are_no_picture_are_refused_by_their_names(tmp_path, names):
     told = image_refusal(write_exr(tmp_path / "a.exr", *part(names)))
     assert "no picture among its channels" in told
     assert all(name in told for name in names.split())
@@ -77,13 +71,13 @@ def test_channels_that_are_no_picture_are_refused_by_their_names(
 
 
 @pytest.mark.parametrize("names", ["R G B A", "Y"])
-def test_of_two_pictures_none_is_chosen(tmp_path: Path, names: str) -> None:
+def test_of_two_pictures_none_is_chosen(tmp_path, names):
     parts = {"left": part(names), "depth": part("Z"), "right": part(names)}
     told = image_refusal(write_parts(tmp_path / "a.exr", parts))
     assert "several parts that are pictures (left: " in told and "right: " in told
 
 
-def test_whole_numbers_are_refused(tmp_path: Path) -> None:
+def test_whole_numbers_are_refused(tmp_path):
     told = image_refusal(write_exr(tmp_path / "a.exr", *part("R G B", "u4")))
     assert "holds samples of type uint; save it as half" in told
 
@@ -91,7 +85,7 @@ def test_whole_numbers_are_refused(tmp_path: Path) -> None:
 HEADER = b"#?RADIANCE\n# made by a test\nFORMAT=32-bit_rle_rgbe\n"
 
 
-def random_bytes(height: int, width: int) -> np.ndarray:
+def random_bytes(height, width):
     """Legal pixels uint8 [h, w, 4], normal numbers of float32; some are black."""
     pixels = RNG.integers(0, 256, (height, width, 4), np.uint8)
     pixels[..., 1] |= 128
@@ -100,14 +94,14 @@ def random_bytes(height: int, width: int) -> np.ndarray:
     return pixels
 
 
-def decoded(pixels: np.ndarray) -> np.ndarray:
+def decoded(pixels):
     """Mantissas m and the exponent e of a pixel are m 2^(e - 136), and 0 where e is."""
     exponent = pixels[..., 3:].astype(int)
     values = np.ldexp(pixels[..., :3].astype(float), exponent - 136) * (exponent > 0)
     return values.astype(np.float32)
 
 
-def run_length(pixels: np.ndarray) -> bytes:
+def run_length(pixels):
     """Each row's four planes, in runs of one byte and literal ones in turns."""
     data = b""
     for row in pixels:
@@ -121,7 +115,7 @@ def run_length(pixels: np.ndarray) -> bytes:
     return data
 
 
-def save_hdr(folder: Path, body: bytes, size: str, header: bytes = HEADER) -> Path:
+def save_hdr(folder, body, size, header=HEADER):
     path = folder / "a.HDR"
     path.write_bytes(header + b"\n" + size.encode() + b"\n" + body)
     return path
@@ -129,14 +123,14 @@ def save_hdr(folder: Path, body: bytes, size: str, header: bytes = HEADER) -> Pa
 
 @pytest.mark.parametrize("encode", [np.ndarray.tobytes, run_length])
 @pytest.mark.parametrize("width", [1, 9, 300])
-def test_pixels_come_back(tmp_path: Path, encode: object, width: int) -> None:
+def test_pixels_come_back(tmp_path, encode, width):
     pixels = random_bytes(4, width)
     body = pixels.tobytes() if width < 8 else encode(pixels)
     image = read_image(save_hdr(tmp_path, body, f"-Y 4 +X {width}"))
     np.testing.assert_allclose(image.pixels, decoded(pixels), rtol=1e-6)
 
 
-def test_exposures_are_divided_out(tmp_path: Path) -> None:
+def test_exposures_are_divided_out(tmp_path):
     pixels = random_bytes(2, 9)
     header = HEADER + b"EXPOSURE=4\nEXPOSURE= 0.5 \nVIEW=-vtl\n"
     found = read_image(save_hdr(tmp_path, run_length(pixels), "-Y 2 +X 9", header)).pixels
@@ -156,12 +150,12 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
-def test_what_cannot_be_used_is_named(tmp_path: Path, case: str) -> None:
+def test_what_cannot_be_used_is_named(tmp_path, case):
     size, header, reason = UNUSABLE[case]
     assert reason in image_refusal(save_hdr(tmp_path, run_length(random_bytes(2, 9)), size, header))
 
 
-def test_old_runs_are_not_taken_for_pixels(tmp_path: Path) -> None:
+def test_old_runs_are_not_taken_for_pixels(tmp_path):
     """(1, 1, 1, n) once said: the last pixel n times more."""
     body = bytes([3, 128, 3, 128, 1, 1, 1, 8]) * 2
     assert "old way" in image_refusal(save_hdr(tmp_path, body, "-Y 2 +X 9"))
@@ -173,9 +167,7 @@ LAYOUTS = [{"compression": "zlib"}, TILES, {"planarconfig": "separate"}]
 
 @pytest.mark.parametrize("options", LAYOUTS, ids=", ".join)
 @pytest.mark.parametrize("dtype", [np.float16, np.float64])
-def test_every_layout_is_read_right_or_refused(
-    tmp_path: Path, dtype: type, options: dict[str, object]
-):
+def test_every_layout_is_read_right_or_refused(tmp_path, dtype, options):
     pixels = np.random.default_rng(2).random((20, 33, 3)).astype(dtype)
     if dtype is np.float64 and "tile" in options:
         tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", **options)
@@ -191,7 +183,7 @@ def test_every_layout_is_read_right_or_refused(
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_straight_alpha_is_multiplied_and_an_unspecified_sample_is_refused(
-    tmp_path: Path, colors: int, alpha: str, planes: str, dtype: type
+    tmp_path, colors, alpha, planes, dtype
 ):
     pixels = np.random.default_rng(3).random((4, 5, colors + 1)).astype(dtype)
     tifffile.imwrite(
@@ -212,7 +204,7 @@ def test_straight_alpha_is_multiplied_and_an_unspecified_sample_is_refused(
 
 
 @pytest.mark.parametrize("gamma", [None, 1.0, 1.8, 2.2])
-def test_a_profile_that_is_not_linear_is_refused(tmp_path: Path, gamma: float | None):
+def test_a_profile_that_is_not_linear_is_refused(tmp_path, gamma):
     pixels, profile = np.random.default_rng(4).random((2, 3, 3), np.float32), icc_profile(gamma)
     tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", iccprofile=profile)
     if gamma == 1:
@@ -221,7 +213,7 @@ def test_a_profile_that_is_not_linear_is_refused(tmp_path: Path, gamma: float | 
         assert "is not linear by its color profile" in image_refusal(tmp_path / "a.tif")
 
 
-def test_primaries_of_a_profile_are_said(tmp_path: Path):
+def test_primaries_of_a_profile_are_said(tmp_path):
     profile = icc_profile(1.0, has_swapped_primaries=True)
     pixels = np.ones((2, 3, 3), np.float32)
     tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", iccprofile=profile)
@@ -239,9 +231,7 @@ def test_primaries_of_a_profile_are_said(tmp_path: Path):
         (np.ones((2, 2, 2), np.float32), {}, "has several pages"),
     ],
 )
-def test_other_kinds_are_refused_by_name(
-    tmp_path: Path, pixels: np.ndarray, options: dict[str, object], why: str
-):
+def test_other_kinds_are_refused_by_name(tmp_path, pixels, options, why):
     tifffile.imwrite(tmp_path / "a.tif", pixels, **({"photometric": "minisblack"} | options))
     with pytest.raises(FormatError, match=why):
         read_image(tmp_path / "a.tif")

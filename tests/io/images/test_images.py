@@ -1,7 +1,5 @@
 """Images: linear round trips, sRGB decoding, alpha, and refusals that say where the flaw is."""
 
-from pathlib import Path
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ from ddrecon.io.images.table import (
 from ddrecon.pictures import decode, encode
 
 
-def pixels_of(seed: int, *shape: int) -> np.ndarray:
+def pixels_of(seed, *shape):
     return (10 * np.random.default_rng(seed).standard_normal(shape)).astype(np.float32)
 
 
@@ -31,7 +29,7 @@ WRITERS = {".exr": write_exr, ".tif": write_tiff, ".npy": np.save}
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.tif", "Y", "gray"])
-def test_gray_becomes_three_equal_channels(tmp_path: Path, name: str):
+def test_gray_becomes_three_equal_channels(tmp_path, name):
     gray, path = pixels_of(1, 3, 4).astype(np.float16).astype(np.float32), tmp_path / name
     if path.suffix:
         WRITERS[path.suffix](path, gray)
@@ -41,7 +39,7 @@ def test_gray_becomes_three_equal_channels(tmp_path: Path, name: str):
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".npy", ".tif"])
-def test_float_alpha_empties_pixels_and_leaves_premultiplied_ones(tmp_path: Path, suffix: str):
+def test_float_alpha_empties_pixels_and_leaves_premultiplied_ones(tmp_path, suffix):
     rgba = np.ones((2, 2, 4), np.float32)
     rgba[0, 0, 3], rgba[0, 1, 3] = 0, 0.5
     path = tmp_path / f"a{suffix}"
@@ -52,7 +50,7 @@ def test_float_alpha_empties_pixels_and_leaves_premultiplied_ones(tmp_path: Path
 
 
 @pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
-def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, what: str):
+def test_flawed_pixels_are_located_and_counted(tmp_path, value, what):
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2, 1] = pixels[3, 0] = value
     np.save(tmp_path / "a.npy", pixels)
@@ -62,20 +60,20 @@ def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, wha
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, bool])
-def test_whole_numbers_are_no_radiance(tmp_path: Path, dtype: type):
+def test_whole_numbers_are_no_radiance(tmp_path, dtype):
     np.save(tmp_path / "a.npy", np.ones((2, 2, 3), dtype))
     with pytest.raises(FormatError, match=f"whole numbers .*{np.dtype(dtype)}.*; save it as float"):
         read_image(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2, 2), (2, 2, 5), (1, 2, 2, 3), (0, 2, 3)])
-def test_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]):
+def test_arrays_of_other_shapes_are_refused(tmp_path, shape):
     np.save(tmp_path / "a.npy", np.zeros(shape))
     with pytest.raises(FormatError, match=r"expected \[h, w\]"):
         read_image(tmp_path / "a.npy")
 
 
-def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
+def test_linear_files_keep_dots_in_their_names(tmp_path):
     pytest.importorskip("OpenImageIO")
     pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
     paths = write_linear(tmp_path / "front.single", pixels)
@@ -86,12 +84,12 @@ def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
 
 
 @given(st.floats(0, 1))
-def test_srgb_decodes_what_it_encodes(linear: float):
+def test_srgb_decodes_what_it_encodes(linear):
     value = np.array(linear)
     assert abs(decode(encode(value)) - value) < 1e-7
 
 
-def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
+def test_preview_is_8_bit_srgb_and_clipped(tmp_path):
     write_preview(tmp_path / "a.png", np.array([[[-1, 0.18, 7], [np.nan, 0, 1]]]))
     assert iio.imread(tmp_path / "a.png").tolist() == [[[0, 118, 255], [0, 0, 255]]]
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
@@ -100,7 +98,7 @@ def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
 @pytest.mark.parametrize(
     ("suffix", "off"), [(".png", 1e-6), (".webp", 1e-6), (".jpg", 0.02), (".jpeg", 0.02)]
 )
-def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str, off: float):
+def test_8_bit_colors_are_decoded_from_srgb(tmp_path, suffix, off):
     """Up to the compression of the file."""
     stored = np.full((16, 16, 3), (200, 100, 50), np.uint8)
     Pillow.fromarray(stored).save(tmp_path / f"a{suffix}", lossless=True, quality=95)
@@ -115,7 +113,7 @@ DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8)}
 @pytest.mark.parametrize(
     ("kind", "depth"), [(kind, depth) for kind in DEPTHS for depth in DEPTHS[kind]]
 )
-def test_transparent_colors_of_png_are_alpha(tmp_path: Path, kind: int, depth: int, is_clear: bool):
+def test_transparent_colors_of_png_are_alpha(tmp_path, kind, depth, is_clear):
     """Gray and RGB have one that is, palettes an alpha of each, in full to a last one."""
     if (kind, depth) == (2, 16):
         pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
@@ -143,7 +141,7 @@ def test_transparent_colors_of_png_are_alpha(tmp_path: Path, kind: int, depth: i
     assert np.allclose(image.pixels, np.broadcast_to(colors, (5, 7, 3)), atol=1e-6)
 
 
-def save_mask(path: Path, inside: np.ndarray, mode: str) -> np.ndarray:
+def save_mask(path, inside, mode):
     """Saves `inside` [h, w] as a mask of Pillow's `mode`, or the dtype of an array."""
     if path.suffix == ".npy":
         np.save(path, inside.astype(mode) * (255 if mode == "uint8" else 1))
@@ -164,7 +162,7 @@ MASKS = [
 
 
 @pytest.mark.parametrize(("suffix", "mode"), MASKS)
-def test_a_mask_is_the_same_in_every_format(tmp_path: Path, suffix: str, mode: str):
+def test_a_mask_is_the_same_in_every_format(tmp_path, suffix, mode):
     """Also where compression leaves traces in black."""
     inside = np.zeros((64, 64), np.uint8)
     inside[21:43, 19:45] = 1
@@ -173,7 +171,7 @@ def test_a_mask_is_the_same_in_every_format(tmp_path: Path, suffix: str, mode: s
     assert mask.dtype == np.float32 and np.array_equal(mask[..., 0], inside)
 
 
-def test_a_mask_counts_from_half_on_as_stored(tmp_path: Path):
+def test_a_mask_counts_from_half_on_as_stored(tmp_path):
     """Whatever curve it names."""
     stored = [[127, 0, 0, 255], [128, 0, 0, 200], [255, 255, 255, 127], [255, 255, 255, 128]]
     iio.imwrite(tmp_path / "m.png", np.array([stored], np.uint8))
@@ -185,7 +183,7 @@ def test_a_mask_counts_from_half_on_as_stored(tmp_path: Path):
 
 
 @pytest.mark.parametrize("level", [2, 127])
-def test_a_mask_of_labels_is_refused_but_a_black_one_is_none(tmp_path: Path, level: int):
+def test_a_mask_of_labels_is_refused_but_a_black_one_is_none(tmp_path, level):
     stored = np.zeros((2, 3), np.uint8)
     iio.imwrite(tmp_path / "m.png", stored)
     assert not read_mask(tmp_path / "m.png").pixels.any()
@@ -197,7 +195,7 @@ def test_a_mask_of_labels_is_refused_but_a_black_one_is_none(tmp_path: Path, lev
             read_mask(tmp_path / name)
 
 
-def test_a_movie_keeps_its_frames_in_order(tmp_path: Path) -> None:
+def test_a_movie_keeps_its_frames_in_order(tmp_path):
     pictures = [np.full((17, 23, 3), level, np.uint8) for level in range(0, 210, 30)]
     for picture in pictures:
         picture[:4, :4] += 40
@@ -209,7 +207,7 @@ def test_a_movie_keeps_its_frames_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "webp"])
-def test_an_animation_is_refused(tmp_path: Path, suffix: str) -> None:
+def test_an_animation_is_refused(tmp_path, suffix):
     first, second = (Pillow.new("RGB", (4, 3), color) for color in ("red", "blue"))
     first.save(tmp_path / f"a.{suffix}", save_all=True, append_images=[second])
     with pytest.raises(FormatError, match="is an animation of 2 pictures; save a single one"):

@@ -1,8 +1,5 @@
 """netCDF: axes told by CF attributes or by name, in any order, direction and unit of length."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from refusals import refusal
@@ -15,13 +12,9 @@ BOUNDS = np.array([[-1.0, -2.0, 6.0], [1.0, 2.5, 9.0]])
 VALUES = np.random.default_rng(0).random((3, 5, 4)).astype(np.float32)
 CENTERS = {"x": [-0.75, -0.25, 0.25, 0.75], "y": [-1.55, -0.65, 0.25, 1.15, 2.05]}
 CENTERS["z"] = [6.5, 7.5, 8.5]
-Axis = tuple[Any, dict[str, str]]
-"""The numbers of a coordinate, and its attributes."""
 
 
-def written(
-    path: Path, values: np.ndarray, dimensions: str, kind: str = "NETCDF4", **axes: Axis
-) -> Path:
+def written(path, values, dimensions, kind="NETCDF4", **axes):
     """A file with `QN` on `dimensions`, and a coordinate and its attributes for each of `axes`."""
     with netcdf.Dataset(path, "w", format=kind) as file:
         for name, count in zip(dimensions.split(), values.shape, strict=True):
@@ -34,7 +27,7 @@ def written(
     return path
 
 
-def plain(**units: str) -> dict[str, Axis]:
+def plain(**units):
     """Coordinates called x, y and z, in these units."""
     axes = {axis: (np.array(CENTERS[axis]), {}) for axis in "xyz"}
     for axis, unit in units.items():
@@ -43,7 +36,7 @@ def plain(**units: str) -> dict[str, Axis]:
 
 
 @pytest.mark.parametrize("order", ["z y x", "x y z", "y z x", "time z y x"])
-def test_axes_come_in_any_order(tmp_path: Path, order: str) -> None:
+def test_axes_come_in_any_order(tmp_path, order):
     places = ["zyx".index(name) for name in order.split() if name != "time"]
     values = VALUES.transpose(places)
     values = values[None] if order.startswith("time") else values
@@ -52,7 +45,7 @@ def test_axes_come_in_any_order(tmp_path: Path, order: str) -> None:
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
 
-def test_axes_are_told_by_attribute_before_name(tmp_path: Path) -> None:
+def test_axes_are_told_by_attribute_before_name(tmp_path):
     names = {"y": "x", "north": "y", "height": "z"}
     axes = {name: (CENTERS[axis], {"axis": axis.upper()}) for name, axis in names.items()}
     field = read_field(written(tmp_path / "f.nc", VALUES, "height north y", **axes), "QN")
@@ -67,7 +60,7 @@ def test_axes_are_told_by_attribute_before_name(tmp_path: Path) -> None:
         ({"x": "", "y": ""}, 1),
     ],
 )
-def test_lengths_are_in_the_unit_of_x(tmp_path: Path, units: dict, scale: float) -> None:
+def test_lengths_are_in_the_unit_of_x(tmp_path, units, scale):
     field = read_field(written(tmp_path / "f.nc", VALUES, "z y x", **plain(**units)), "QN")
     assert np.allclose(field.bounds, BOUNDS * scale, rtol=1e-12)
 
@@ -82,9 +75,7 @@ def test_lengths_are_in_the_unit_of_x(tmp_path: Path, units: dict, scale: float)
         ("floor", {"standard_name": "depth", "units": "m"}),
     ],
 )
-def test_depths_are_heights_below_0(
-    tmp_path: Path, name: str, attributes: dict[str, str], order: int
-) -> None:
+def test_depths_are_heights_below_0(tmp_path, name, attributes, order):
     unit = attributes.get("units", "")
     axes = plain(x=unit, y=unit)
     del axes["z"]
@@ -98,9 +89,7 @@ def test_depths_are_heights_below_0(
     "names",
     [("nk", "nj", "ni"), ("nz", "ny", "nx"), ("bottom_top", "south_north", "west_east")],
 )
-def test_coordinates_may_have_other_names_and_stand_in_groups(
-    tmp_path: Path, names: tuple[str, ...]
-) -> None:
+def test_coordinates_may_have_other_names_and_stand_in_groups(tmp_path, names):
     """A profile of another quantity along an axis, or a length across it, is no coordinate."""
     path = tmp_path / "f.nc"
     with netcdf.Dataset(path, "w") as file:
@@ -120,7 +109,7 @@ def test_coordinates_may_have_other_names_and_stand_in_groups(
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
 
-def test_a_group_may_have_dimensions_of_the_same_names(tmp_path: Path) -> None:
+def test_a_group_may_have_dimensions_of_the_same_names(tmp_path):
     path = written(tmp_path / "f.nc", VALUES, "z y x", **plain())
     with netcdf.Dataset(path, "a") as file:
         inner = file.createGroup("finer")
@@ -133,9 +122,7 @@ def test_a_group_may_have_dimensions_of_the_same_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["z y x", "time z y x", "y z x"])
-def test_heights_on_several_axes_are_taken_where_all_columns_agree(
-    tmp_path: Path, order: str
-) -> None:
+def test_heights_on_several_axes_are_taken_where_all_columns_agree(tmp_path, order):
     path, sizes = tmp_path / "f.nc", {"time": 1, "z": 3, "y": 5, "x": 4}
     shape = [sizes[name] for name in order.split()]
     along = [-1 if name == "z" else 1 for name in order.split()]
@@ -163,9 +150,7 @@ def test_heights_on_several_axes_are_taken_where_all_columns_agree(
         ("zenith", {}),
     ],
 )
-def test_other_axes_are_not_taken_for_x_y_or_z(
-    tmp_path: Path, name: str, attributes: dict[str, str]
-) -> None:
+def test_other_axes_are_not_taken_for_x_y_or_z(tmp_path, name, attributes):
     """Whose single entry goes, and of whose several one is to be chosen."""
     for count in (1, 2):
         axes = plain() | {name: (np.arange(count), attributes)}
@@ -209,9 +194,7 @@ METERS = dict.fromkeys("xyz", "m")
         ("z sigma", None, "sigma says no unit of length; interpolate to heights"),
     ],
 )
-def test_what_is_no_length_is_refused(
-    tmp_path: Path, renamed: str, attributes: dict[str, str] | None, told: str
-) -> None:
+def test_what_is_no_length_is_refused(tmp_path, renamed, attributes, told):
     """Degrees, pressures, numbers of levels, and silence beside meters."""
     axis, name = renamed.split()
     axes = plain(**METERS)
@@ -223,7 +206,7 @@ def test_what_is_no_length_is_refused(
     )
 
 
-def test_packed_values_are_unpacked(tmp_path: Path) -> None:
+def test_packed_values_are_unpacked(tmp_path):
     path = written(tmp_path / "f.nc", VALUES, "z y x")
     with netcdf.Dataset(path, "a") as file:
         packed = file.createVariable("QP", "i2", ("z", "y", "x"), fill_value=-1)
@@ -236,7 +219,7 @@ def test_packed_values_are_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", [0, 1, -1])
-def test_downward_axes_are_turned(tmp_path: Path, order: int) -> None:
+def test_downward_axes_are_turned(tmp_path, order):
     """As pressure levels are; the ends of a cell, where they are said, come in either order."""
     axes = plain() | {"z": (CENTERS["z"][::-1], {})}
     path = written(tmp_path / "f.nc", VALUES[::-1], "z y x", **axes)
@@ -250,7 +233,7 @@ def test_downward_axes_are_turned(tmp_path: Path, order: int) -> None:
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
 
-def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
+def test_a_file_without_coordinates_has_no_box(tmp_path):
     """Nor one whose coordinate is in words."""
     path = written(tmp_path / "f.nc", VALUES, "bottom_top south_north west_east")
     with netcdf.Dataset(path, "a") as file:
@@ -260,7 +243,7 @@ def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
     assert np.array_equal(field.values, VALUES) and field.bounds is None
 
 
-def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused_with_advice(tmp_path):
     path = tmp_path / "f.nc"
     with pytest.raises(FormatError, match=r"read, not written: take \.npz"):
         write_field(path, "density", VALUES, BOUNDS)

@@ -2,7 +2,6 @@
 
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import openvdb_python
@@ -10,24 +9,23 @@ import pytest
 from refusals import refusal
 
 from ddrecon.errors import DataWarning
-from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
 
 
-def sparse(*shape: int, seed: int = 0) -> np.ndarray:
+def sparse(*shape, seed=0):
     """Values of which most are 0, whole leaves among them."""
     rng = np.random.default_rng(seed)
     return np.where(rng.random(shape) > 0.999, rng.random(shape), 0).astype(np.float32)
 
 
-def written(path: Path, facts: Facts | None = None, **fields: np.ndarray) -> Path:
+def written(path, facts=None, **fields):
     write_fields(path, fields, BOUNDS, facts)
     return path
 
 
-def test_the_tools_of_openvdb_list_the_grids(tmp_path: Path) -> None:
+def test_the_tools_of_openvdb_list_the_grids(tmp_path):
     if shutil.which("vdb_print") is None:
         pytest.skip("no vdb_print: apt-get install libopenvdb-tools")
     shape, path = (9, 40, 17), tmp_path / "smoke.vdb"
@@ -42,7 +40,7 @@ def test_the_tools_of_openvdb_list_the_grids(tmp_path: Path) -> None:
     assert empty.startswith("sigma_a\n") and "Background value: 0\n" in empty
 
 
-def test_openvdb_knows_facts_and_what_vectors_are(tmp_path: Path) -> None:
+def test_openvdb_knows_facts_and_what_vectors_are(tmp_path):
     """Numbers, colors and texts are metadata of each grid; arrows turn with a grid, colors not."""
     facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.1), "units": "sigma_t [1/u] µ"}
     vectors = dict.fromkeys(("velocity", "albedo"), sparse(9, 4, 5, 3))
@@ -58,7 +56,7 @@ def test_openvdb_knows_facts_and_what_vectors_are(tmp_path: Path) -> None:
     }
 
 
-def test_facts_come_back_as_labels(tmp_path: Path) -> None:
+def test_facts_come_back_as_labels(tmp_path):
     """Those of OpenVDB's library too, of every type; what tells of the file alone is left out."""
     facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.1), "units": "sigma_t [1/u] µ"}
     path = written(tmp_path / "smoke.vdb", facts, density=sparse(9, 4, 5))
@@ -83,7 +81,7 @@ vdb.write(f"{sys.argv[1]}/theirs.vdb", [grid])
 """
 
 
-def test_only_leaves_that_hold_something_are_there(tmp_path: Path) -> None:
+def test_only_leaves_that_hold_something_are_there(tmp_path):
     """Also in a box so long that the root of the tree has two children."""
     density = sparse(9, 12, 4200)
     leaves = {(z // 8, y // 8, x // 8) for z, y, x in np.argwhere(density)}
@@ -98,9 +96,7 @@ def test_only_leaves_that_hold_something_are_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "kind"), [((4, 3, 2), "ScaleTranslateMap"), ((12, 9, 4), "UniformScaleTranslateMap")]
 )
-def test_cells_lie_where_openvdb_has_them(
-    tmp_path: Path, shape: tuple[int, int, int], kind: str
-) -> None:
+def test_cells_lie_where_openvdb_has_them(tmp_path, shape, kind):
     """Index (0, 0, 0) is the center of the first cell."""
     path = written(tmp_path / "smoke.vdb", density=np.ones(shape))
     facts = (
@@ -113,7 +109,7 @@ def test_cells_lie_where_openvdb_has_them(
 
 
 @pytest.mark.parametrize("colors", [(), (3,)])
-def test_a_haze_is_not_written(tmp_path: Path, colors: tuple[int, ...]) -> None:
+def test_a_haze_is_not_written(tmp_path, colors):
     """Below a ten thousandth of the largest, of either sign: a sequence stays sparse."""
     rng = np.random.default_rng(0)
     haze = (
@@ -174,7 +170,7 @@ for grid in [*grids[:4], again]:
 """
 
 
-def test_files_of_openvdb_are_read(tmp_path: Path) -> None:
+def test_files_of_openvdb_are_read(tmp_path):
     """As itself reads them: packed by Blosc, with tiles, halves and a shared tree."""
     openvdb_python.run(MAKE, tmp_path)
     path = tmp_path / "theirs.vdb"

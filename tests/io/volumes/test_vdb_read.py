@@ -2,7 +2,6 @@
 
 import struct
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +17,9 @@ from ddrecon.io.volumes.table import read_field
 NONE, ZIP, MASK, BLOSC = 0, 1, 2, 4
 QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=20)
 HALF = 0.5
-Placed = tuple[np.ndarray, np.ndarray]
 
 
-def leaf(rng: np.random.Generator, grid: Grid) -> Placed:
+def leaf(rng, grid):
     """Values and activity of a leaf, inactive values of none to many kinds among them."""
     is_active = rng.random(512) < rng.choice([0, 0.02, 0.5, 1])
     choices = [[0], [grid.background], [-grid.background], [-1, 1], [0.25, 7], [1, 2, 3]]
@@ -32,7 +30,7 @@ def leaf(rng: np.random.Generator, grid: Grid) -> Placed:
     return (values * np.linspace(1, 2, grid.components)).astype(np.float16), is_active
 
 
-def filled(grid: Grid, seed: int, size: int = 3) -> Grid:
+def filled(grid, seed, size=3):
     """`grid` with leaves and tiles on both sides of 0, and a leaf in another root's child."""
     rng = np.random.default_rng(seed)
     for _ in range(size):
@@ -55,14 +53,8 @@ def filled(grid: Grid, seed: int, size: int = 3) -> Grid:
     seed=st.integers(0, 2**32),
 )
 def test_values_come_back_bit_for_bit(
-    tmp_path_factory: pytest.TempPathFactory,
-    flags: int,
-    kind: str,
-    is_half: bool,
-    version: int,
-    background: float,
-    seed: int,
-) -> None:
+    tmp_path_factory, flags, kind, is_half, version, background, seed
+):
     """Of every type and version, however they are compressed: inactive ones and tiles, too."""
     if version < 222:
         flags &= ZIP
@@ -75,7 +67,7 @@ def test_values_come_back_bit_for_bit(
     assert np.allclose(field.bounds, [HALF * (low - 0.5), HALF * (high - 0.5)])
 
 
-def test_what_is_large_is_a_tile(tmp_path: Path) -> None:
+def test_what_is_large_is_a_tile(tmp_path):
     """Of a root, inactive and beyond the box; and of an upper node, active."""
     grid = Grid(leaves={(4088, 0, 0): (np.ones((512, 1)), np.ones(512, bool))})
     grid.tiles = [
@@ -93,7 +85,7 @@ def test_what_is_large_is_a_tile(tmp_path: Path) -> None:
     assert np.array_equal(values[0, 0], expected)
 
 
-def test_a_shared_tree_has_its_own_transform(tmp_path: Path) -> None:
+def test_a_shared_tree_has_its_own_transform(tmp_path):
     """And grids of the same name have numbers."""
     first = filled(Grid(name="density\x1e0", flags=BLOSC | MASK), 1)
     second = Grid(name="density\x1e1", parent="density\x1e0", map=("UniformScaleMap", [2.0] * 15))
@@ -109,11 +101,11 @@ def test_a_shared_tree_has_its_own_transform(tmp_path: Path) -> None:
     assert told == "density[0] shares the tree of density[1], which is not there"
 
 
-def moved(*steps: float, by: tuple[float, float, float] = (0, 0, 0)) -> tuple[str, list[float]]:
+def moved(*steps, by=(0, 0, 0)):
     return "ScaleTranslateMap", [*by, *steps, *[0] * 12]
 
 
-def test_grids_with_the_same_voxels_share_a_box(tmp_path: Path) -> None:
+def test_grids_with_the_same_voxels_share_a_box(tmp_path):
     """Also where their voxels are counted from elsewhere; a velocity widens no other grid's box."""
     leaf_of = {(0, 0, 0): (np.ones((512, 1)), np.ones(512, bool))}
     density = Grid(leaves=leaf_of, map=moved(0.1, 0.2, 0.3))
@@ -136,7 +128,7 @@ def test_grids_with_the_same_voxels_share_a_box(tmp_path: Path) -> None:
     assert read_field(path, "Vel").resolution == (104, 8, 9)
 
 
-def affine(steps: np.ndarray) -> tuple[str, np.ndarray]:
+def affine(steps):
     rows = np.eye(4)
     rows[:3, :3], rows[3, :3] = steps, (1, 2, 3)
     return "AffineMap", rows.ravel()
@@ -150,7 +142,7 @@ def affine(steps: np.ndarray) -> tuple[str, np.ndarray]:
         [[0, -1, 0], [0, 0, 1], [3, 0, 0]],
     ],
 )
-def test_exchanged_and_mirrored_axes_are_put_in_order(tmp_path: Path, steps: np.ndarray) -> None:
+def test_exchanged_and_mirrored_axes_are_put_in_order(tmp_path, steps):
     """Each voxel keeps its place in the world."""
     grid = filled(Grid(map=affine(steps), flags=MASK), 3)
     field = read_field(write_file(tmp_path / "a.vdb", grid), "density")
@@ -164,7 +156,7 @@ def test_exchanged_and_mirrored_axes_are_put_in_order(tmp_path: Path, steps: np.
         assert field.values[z, y, x] == values[tuple(index)]
 
 
-def test_a_turned_grid_is_resampled(tmp_path: Path) -> None:
+def test_a_turned_grid_is_resampled(tmp_path):
     """A linear function stays one within, nothing is beyond, and the mass is the same."""
     cosine, sine = np.cos(0.5), np.sin(0.5)
     steps = 0.1 * np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
@@ -195,7 +187,7 @@ def test_a_turned_grid_is_resampled(tmp_path: Path) -> None:
     assert abs(values.sum() / value.sum() - 1) < 0.02
 
 
-def test_bounds_of_another_program_need_no_scale(tmp_path: Path) -> None:
+def test_bounds_of_another_program_need_no_scale(tmp_path):
     """Every type of transform, as OpenVDB's own arithmetic has it."""
     maps = {
         "ScaleMap": [1, 2, 3, *[0] * 12],
@@ -230,11 +222,11 @@ FULL = {(0, 0, 0): (np.ones((512, 1)), np.ones(512, bool))}
         (Grid(tiles=[Tile((0, 0, 0), 4096, np.ones(1), True)]), "density, of 4096 x 4096 x 4096 "),
     ],
 )
-def test_what_is_no_fog_is_refused_by_name(tmp_path: Path, grid: Grid, reason: str) -> None:
+def test_what_is_no_fog_is_refused_by_name(tmp_path, grid, reason):
     assert refusal(write_file(tmp_path / "a.vdb", grid)).startswith(reason)
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path):
     path = tmp_path / "a.vdb"
     for version in (219, 226):
         told = refusal(write_file(path, Grid(leaves=FULL), version=version))
@@ -254,7 +246,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("flags", [ZIP, BLOSC])
-def test_a_bomb_is_not_unpacked(tmp_path: Path, flags: int) -> None:
+def test_a_bomb_is_not_unpacked(tmp_path, flags):
     """A node's values are unpacked as far as it has some."""
     whole = write_file(tmp_path / "a.vdb", Grid(leaves=FULL, flags=flags)).read_bytes()
     pack = Encoder(Grid(flags=flags), 224).many

@@ -1,7 +1,6 @@
 """Archives of numpy and .vol, and what every volume must be."""
 
 import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ CUBE = np.ones((2, 2, 2))
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64, np.uint8, bool])
-def test_every_real_type_is_read_as_float32(tmp_path: Path, dtype: type) -> None:
+def test_every_real_type_is_read_as_float32(tmp_path, dtype):
     np.savez(tmp_path / "f.npz", density=np.ones((2, 3, 4), dtype))
     field = read_field(tmp_path / "f.npz", "density")
     assert field.values.dtype == np.float32 and field.values.min() == 1 and field.bounds is None
@@ -25,9 +24,7 @@ def test_every_real_type_is_read_as_float32(tmp_path: Path, dtype: type) -> None
 
 @pytest.mark.parametrize("before", [(), (1,), (1, 1)])
 @pytest.mark.parametrize("behind", [(), (1,), (1, 1), (3,), (3, 1)])
-def test_axes_of_one_entry_beside_those_of_cells_go(
-    tmp_path: Path, before: tuple[int, ...], behind: tuple[int, ...]
-) -> None:
+def test_axes_of_one_entry_beside_those_of_cells_go(tmp_path, before, behind):
     """As of ScalarFlow's [z, y, x, 1], or of a batch of one."""
     values = np.random.default_rng(0).random((2, 3, 4, *behind), np.float32)
     np.savez(tmp_path / "f.npz", data=values.reshape(*before, *values.shape))
@@ -35,7 +32,7 @@ def test_axes_of_one_entry_beside_those_of_cells_go(
     assert np.array_equal(found, values.reshape((2, 3, 4, 3) if 3 in behind else (2, 3, 4)))
 
 
-def flawed(value: float) -> np.ndarray:
+def flawed(value):
     values = np.zeros((2, 3, 4))
     values[1, 2, 3] = value
     return values
@@ -57,14 +54,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("arrays", "told"), REFUSED)
-def test_what_is_no_field_is_refused_with_advice(
-    tmp_path: Path, arrays: dict[str, Any], told: str
-) -> None:
+def test_what_is_no_field_is_refused_with_advice(tmp_path, arrays, told):
     np.savez(tmp_path / "f.npz", **arrays)
     assert told in refusal(tmp_path / "f.npz")
 
 
-def test_nanovdb_is_refused_with_what_converts_it(tmp_path: Path) -> None:
+def test_nanovdb_is_refused_with_what_converts_it(tmp_path):
     path = tmp_path / "smoke.nvdb"
     with pytest.raises(FormatError, match=r"try nanovdb_convert smoke\.nvdb"):
         describe(path)
@@ -74,7 +69,7 @@ VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 
 
 @pytest.mark.parametrize("has_colors", [False, True])
-def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, has_colors: bool) -> None:
+def test_mitsuba_reads_and_writes_the_same_files(tmp_path, has_colors):
     mitsuba = pytest.importorskip("mitsuba", reason="needs Mitsuba 3 (the extra `reference`)")
     values = np.stack([VALUES, 2 * VALUES, 3 * VALUES], -1) if has_colors else VALUES
     mitsuba.set_variant("scalar_rgb")
@@ -92,9 +87,7 @@ DAMAGES += [(8, "<i", -4, "is damaged"), (20, "<i", 2, "is damaged")]
 
 
 @pytest.mark.parametrize(("offset", "layout", "value", "reason"), DAMAGES)
-def test_a_damaged_vol_is_refused(
-    tmp_path: Path, offset: int, layout: str, value: int | bytes, reason: str
-) -> None:
+def test_a_damaged_vol_is_refused(tmp_path, offset, layout, value, reason):
     path = tmp_path / "f.vol"
     write_field(path, "density", VALUES, BOUNDS)
     data = bytearray(path.read_bytes())
