@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from ddrecon.errors import SolveError
 from ddrecon.pictures import estimate_noise
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, Replays, solve_tolerances
-from ddrecon.reconstruct.metric import Point, find_diagonals
+from ddrecon.reconstruct.metric import Point
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
 from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
@@ -147,16 +147,6 @@ class Frame:
             total += view.weight / weights * float(loss)
         return total / self.problem.unit
 
-    def find_diagonals(self, names: Sequence[str], compared: Comparison) -> dict[str, Tensor]:
-        """The diagonal of the objective's Gauss-Newton matrix, by the parameters called `names`."""
-        memory = self.memory
-        # Random pictures need no exact light, and their adjoint is near to no other.
-        inexact = SolveMemory(
-            memory.is_warm, dict(memory.last), memory.records, solve_tolerances(1.0)
-        )
-        parameters = [p for p in self.parameters if p.name in names]
-        return find_diagonals(self.point(compared), parameters, inexact)
-
     def point(self, compared: Comparison) -> Point:
         """Where the parameters stand, with how strongly the pixels `compared` count."""
         values = {p.name: p.value.detach() for p in self.parameters}
@@ -220,7 +210,7 @@ class Frame:
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         return {
-            "parameters": {p.name: p.state() for p in self.parameters},
+            "parameters": {p.name: p.value.detach() for p in self.parameters},
             "total": dict(vars(self.total)),
             "solutions": dict(self.memory.last),
             "iterations": dict(self.memory.iterations),
@@ -229,9 +219,9 @@ class Frame:
 
     def restore(self, state: Mapping[str, Any], level: int) -> None:
         """Takes up the `state` of a frame that was at a `level` of resolution."""
-        for p in self.parameters:
-            p.restore(state["parameters"][p.name])
         self.enter(level)
+        for p in self.parameters:
+            p.value = state["parameters"][p.name].clone().requires_grad_()
         self.total, self.misfit = Row(**state["total"]), state["misfit"]
         self.memory.last = dict(state["solutions"])
         # By which iterations are recorded on a GPU.

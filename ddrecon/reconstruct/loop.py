@@ -20,7 +20,7 @@ from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.frame import Evaluation, Frame, Result, Row
-from ddrecon.reconstruct.metric import Numbers, apply_metric
+from ddrecon.reconstruct.metric import Numbers, apply_metric, find_diagonals
 from ddrecon.reconstruct.objective import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
@@ -67,17 +67,16 @@ class Reconstruction:
         forget_changed()
         self.frames = [Frame(frame_scene, iterations) for frame_scene in (scene, *others)]
         first = self.frames[0]
-        self.memory, self.parameters, problem = first.memory, first.parameters, first.problem
-        self.problem = problem
+        self.memory, self.parameters, self.problem = first.memory, first.parameters, first.problem
         self.shared = [p for p in self.parameters if not p.is_field]
         names = {p.name: p for p in self.shared}
         for frame in self.frames:
             frame.parameters = [names.get(p.name, p) for p in frame.parameters]
-        self.numbers = Numbers(problem.train, self.parameters)
+        self.numbers = Numbers(self.problem.train, self.parameters)
         blocks = dict.fromkeys(p for frame in self.frames for p in frame.parameters)
         self.blocks = sorted(blocks, key=lambda p: p in self.numbers.places)
-        stages = find_stages(len(problem.factors), problem.train, self.blocks)
-        self.schedule = Schedule(problem.settings.iterations, stages)
+        stages = find_stages(len(self.problem.factors), self.problem.train, self.blocks)
+        self.schedule = Schedule(self.problem.settings.iterations, stages)
         self.rival: tuple[float, Tensor] = (math.inf, torch.empty(0))
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
@@ -248,11 +247,12 @@ class Reconstruction:
 
     def _find_metric(self, evaluations: Sequence[Evaluation]) -> None:
         """Takes the metric where the parameters stand."""
-        pairs = list(zip(self.frames, evaluations, strict=True))
-        fields = [p.name for p in self.parameters if p not in self.numbers.places]
-        self.diagonal = self._gather([f.find_diagonals(fields, e.compared) for f, e in pairs])
+        pairs = zip(self.frames, evaluations, strict=True)
+        points = [frame.point(evaluation.compared) for frame, evaluation in pairs]
+        fields = [[p for p in f.parameters if p not in self.numbers.places] for f in self.frames]
+        self.diagonal = self._gather([*map(find_diagonals, points, fields)])
         if not self.schedule.stage.waiting:
-            self.numbers.prepare([frame.point(e.compared) for frame, e in pairs])
+            self.numbers.prepare(points)
 
     def _project(self, values: Tensor) -> Tensor:
         return self.numbers.hold_gauges(self._map(Parameter.project, values))

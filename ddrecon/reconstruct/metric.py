@@ -32,7 +32,7 @@ from ddrecon.numerics.interpolation import mean_around
 from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.gradients import differentiate, own_views
+from ddrecon.reconstruct.gradients import differentiate, own_views, solve_tolerances
 from ddrecon.reconstruct.parameters import Parameter, face_stiffness
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, kind_of
@@ -53,15 +53,15 @@ class Point:
     solutions: Mapping[tuple[str, int], Tensor]
 
 
-def find_diagonals(
-    point: Point, parameters: Sequence[Parameter], memory: SolveMemory
-) -> dict[str, Tensor]:
+def find_diagonals(point: Point, parameters: Sequence[Parameter]) -> dict[str, Tensor]:
     """The diagonal of J^T W J at `point` by `parameters` that are fields or maps, by name.
 
     Neighbors share what one of them is told. Where pictures say next to nothing the diagonal is
     held above a part of its root mean square.
     """
     names, values = [view.name for view in point.scene.views], point.values
+    # Random pictures need no exact light, and their adjoint is near to no other.
+    memory = SolveMemory(last=dict(point.solutions), tolerance_floor=solve_tolerances(1.0))
     generators = {n: torch.Generator().manual_seed(at) for at, n in enumerate(sorted(names))}
 
     def along(view: View, image: Tensor) -> Tensor:
@@ -122,11 +122,6 @@ def _with_colors(field: Tensor) -> Tensor:
     return field.reshape(-1, *field.shape[-3:]).contiguous()
 
 
-def single_numbers(parameters: Sequence[Parameter]) -> list[Parameter]:
-    """The `parameters` that are neither fields nor maps."""
-    return [p for p in parameters if not p.is_field and p.value.ndim < 2]
-
-
 class Numbers:
     """The single numbers among `parameters`, which the views of `train` and scenes like it show.
 
@@ -136,11 +131,12 @@ class Numbers:
     """
 
     def __init__(self, train: Scene, parameters: Sequence[Parameter]):
-        numbers = single_numbers(parameters)
-        self.places = _places(numbers)
-        self.size = sum(p.value.numel() for p in numbers)
+        numbers = [p for p in parameters if not p.is_field and p.value.ndim < 2]
+        counts = [p.value.numel() for p in numbers]
+        self.size = sum(counts)
+        self.places = dict(zip(numbers, torch.arange(self.size).split(counts), strict=True))
         self.matrix = self.prior = torch.zeros(self.size, self.size).double()
-        self.gauges = find_gauges(train, numbers)
+        self.gauges = find_gauges(train, self.places)
         bounds = ((p.low, p.high) for p in numbers for _ in range(p.value.numel()))
         self.bounds = torch.tensor([*bounds]).double().view(-1, 2)
         poses = [p for p in numbers if p.key == "camera"]
@@ -153,7 +149,7 @@ class Numbers:
 
     def prepare(self, points: Sequence[Point]) -> None:
         """Takes the metric at `points`, one for each scene."""
-        matrix = torch.stack([find_matrix(point, [*self.places]) for point in points]).sum(0)
+        matrix = torch.stack([find_matrix(point, self.places) for point in points]).sum(0)
         prior = torch.zeros_like(matrix)
         for p, precision in self.precisions.items():
             # As strong as what one picture says of a shift in the image by `TRUST` pixels.
@@ -219,16 +215,15 @@ class Numbers:
         return solution
 
 
-def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
-    """J^T W J at `point` between all entries of `numbers`, one after another, in float64.
+def find_matrix(point: Point, places: Mapping[Parameter, Tensor]) -> Tensor:
+    """J^T W J at `point` between the entries of numbers, in float64, which stand in these `places`.
 
     Columns of J are differences of pictures; those of a number of one view are in the light as it
     is.
     """
-    places = _places(numbers)
-    size = sum(p.value.numel() for p in numbers)
+    size = sum(map(len, places.values()))
     total = torch.zeros(size, size, dtype=torch.float64)
-    if not numbers:
+    if not places:
         return total
     names = own_views(point.scene, [view.name for view in point.scene.views])
     columns: dict[str, list[Tensor]] = {name: [] for name in names}
@@ -241,23 +236,20 @@ def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
         world = with_values(scene, values)
         light = solve_light(world, memory)
         pictures = {name: view_picture(light, world, world.view(name)) for name in names}
-        for p in numbers:
-            affected = [name for name in names if p.view in (None, name)]
-            changes: dict[str, list[Tensor]] = {name: [] for name in affected}
+        for p, at in places.items():
             steps, lengths = _small_changes(point, p)
-            for step in steps if affected else ():
-                world, lit = with_values(scene, {**values, p.name: values[p.name] + step}), light
-                if p.view is None:
-                    lit = solve_light(world, SolveMemory(last=dict(memory.last)))
-                for name in affected:
-                    image = view_picture(lit, world, world.view(name))
-                    changes[name].append(image - pictures[name])
-            for name, differences in changes.items():
-                rows = torch.stack(differences)
+            worlds = [with_values(scene, {**values, p.name: values[p.name] + s}) for s in steps]
+            lights = [light] * len(worlds)
+            if p.view is None:
+                lights = [solve_light(w, SolveMemory(last=dict(memory.last))) for w in worlds]
+            for name in names if p.view is None else {p.view} & {*names}:
+                pairs = zip(lights, worlds, strict=True)
+                images = [view_picture(lit, world, world.view(name)) for lit, world in pairs]
+                rows = torch.stack(images) - pictures[name]
                 if len(rows) < len(lengths):  # all colors have changed at once
                     rows = rows * torch.eye(len(lengths)).to(rows)[..., None, None]
                 columns[name].append(rows.flatten(1) / lengths[:, None])
-                entries[name].append(places[p])
+                entries[name].append(at)
     for name in names:
         if not columns[name]:
             continue
@@ -266,13 +258,6 @@ def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
         jacobian, at = (torch.cat(columns[name]) * root).double(), torch.cat(entries[name])
         total[at[:, None], at] += (jacobian @ jacobian.T).cpu()
     return sum_over_ranks([total])[0]
-
-
-def _places(numbers: Sequence[Parameter]) -> dict[Parameter, Tensor]:
-    """Where the entries of each of `numbers` stand, one after another."""
-    counts = [p.value.numel() for p in numbers]
-    places = torch.arange(sum(counts)).split(counts) if counts else ()
-    return dict(zip(numbers, places, strict=True))
 
 
 def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
@@ -318,10 +303,9 @@ class Gauge:
         return slopes
 
 
-def find_gauges(train: Scene, numbers: Sequence[Parameter]) -> list[Gauge]:
-    """The gauges of all `numbers`, where those of every training view of several are among them."""
-    by_name, places = {p.name: p for p in numbers}, _places(numbers)
-    gauges, views = list[Gauge](), train.views
+def find_gauges(train: Scene, places: Mapping[Parameter, Tensor]) -> list[Gauge]:
+    """The gauges of numbers in `places`, where those of all training views of several are there."""
+    by_name, gauges, views = {p.name: p for p in places}, list[Gauge](), train.views
 
     def add(key: str, directions: Callable[[list[Parameter]], Tensor], is_relative: bool) -> None:
         chosen = [by_name.get(f"views.{view.name}.{key}") for view in views]

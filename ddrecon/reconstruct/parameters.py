@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -166,12 +164,3 @@ class Parameter:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
         self.value = (self.value.detach() * self.support).requires_grad_()
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it."""
-        return {"value": self.value.detach(), "shape": list(self.grid.shape)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Takes up a `state`, whatever its resolution."""
-        self.grid = replace(self.grid, shape=tuple(state["shape"]))
-        self.value = state["value"].clone().requires_grad_()

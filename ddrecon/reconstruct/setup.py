@@ -30,8 +30,9 @@ class Problem:
     """What a run is to find, and from what; nothing of it changes.
 
     The objective is the weighted mean of the image loss of `train`'s views plus, for each
-    parameter, its penalty times `power`, the mean square of the targets as the `loss` compares
-    them. `test` has the views that are held out, `factors` how much coarser each level is.
+    parameter, its penalty times `unit`, the mean square of the targets as the `loss` compares them,
+    or 1 if all are black. `test` has the views that are held out, `factors` how much coarser each
+    level is.
     """
 
     scene: Scene
@@ -40,14 +41,9 @@ class Problem:
     test: Scene
     loss: str
     noises: Mapping[str, Noise]
-    power: float
+    unit: float
     support: Support | None
     factors: Sequence[int]
-
-    @property
-    def unit(self) -> float:
-        """What losses are relative to: the power, unless all targets are black."""
-        return self.power or 1.0
 
     @staticmethod
     def of(scene: Scene, iterations: Iterations | None = None) -> Problem:
@@ -74,12 +70,12 @@ class Problem:
             if loss == "photon"
         }
         powers = [target.power for target in targets_of(train, loss, noises).values()]
-        power = float(torch.stack(powers).mean())
+        unit = float(torch.stack(powers).mean()) or 1.0
         support = find_support(train, settings)
         if support is not None:
             support.on(train.volume.grid)  # or there is nothing to find
         levels = factors(scene)
-        return Problem(scene, settings, train, test, loss, noises, power, support, levels)
+        return Problem(scene, settings, train, test, loss, noises, unit, support, levels)
 
     def at(self, level: int) -> Level:
         """The problem at a `level` of resolution, counted from the coarsest."""

@@ -34,7 +34,7 @@ CHECKPOINT_SECONDS = 60.0
 """A job writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
-FORMAT = 11
+FORMAT = 12
 """The version of a checkpoint's contents."""
 ANEW = "start anew with --overwrite"
 UNUSABLE = f"not a usable checkpoint; {ANEW}"

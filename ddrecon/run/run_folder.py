@@ -184,9 +184,7 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
     if not (folder / SCENE).is_file() or not (folder / LOG).is_file():
         raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
     state, loaded = load_checkpoint(folder / CHECKPOINTS)
-    run = Reconstruction(
-        build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
-    )
+    run = Reconstruction(build(state["search"]["values"].dtype))
     restore(run, state, loaded)
     return run
 

@@ -8,7 +8,7 @@ import torch
 
 from ddrecon.cameras import Camera, look_at, twist
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.metric import calibration_prior, find_gauges
+from ddrecon.reconstruct.metric import Numbers, calibration_prior
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.tuning import SHIFT, TURN
 from ddrecon.settings import ParameterSettings
@@ -35,7 +35,7 @@ def world(ball_scene):
 def test_the_mean_exposure_is_held_by_color(world):
     start = torch.ones(len(world.views), 3).double()
     exposures = parameters(world, "exposure", list(start))
-    (gauge,) = find_gauges(world, exposures)
+    (gauge,) = Numbers(world, exposures).gauges
     moved = 1 + torch.rand(start.shape, dtype=torch.float64)
     held = moved.flatten()
     gauge.hold(held)
@@ -46,8 +46,8 @@ def test_the_mean_exposure_is_held_by_color(world):
 
 def test_one_view_alone_and_some_of_several_have_no_gauge(world):
     exposures = parameters(world, "exposure", [torch.ones(1)] * len(world.views))
-    assert find_gauges(world, exposures[1:]) == []
-    assert find_gauges(replace(world, views=world.views[:1]), exposures[:1]) == []
+    assert Numbers(world, exposures[1:]).gauges == []
+    assert Numbers(replace(world, views=world.views[:1]), exposures[:1]).gauges == []
 
 
 def test_a_motion_of_all_cameras_together_is_taken_out(world):
@@ -65,7 +65,7 @@ def test_a_motion_of_all_cameras_together_is_taken_out(world):
         )
         torch.testing.assert_close(before, after)
     cameras = parameters(world, "camera", [torch.zeros(6).double()] * len(world.views))
-    (gauge,) = find_gauges(world, cameras)
+    (gauge,) = Numbers(world, cameras).gauges
     own = [1e-3 * torch.rand(6, dtype=torch.float64) for _ in cameras]
     results = []
     for extra in (1.0, 0.0):

@@ -7,16 +7,15 @@ import pytest
 import torch
 from media import box_grid, data_matrix, make_camera, make_scene, random_values
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.picture import render
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.metric import (
+    Numbers,
     Point,
     apply_metric,
     find_diagonals,
     find_matrix,
-    single_numbers,
 )
 from ddrecon.reconstruct.parameters import Parameter, total_variation
 from ddrecon.scene import Scene, View
@@ -73,7 +72,7 @@ def curvature():
 
 def test_it_is_the_part_of_the_matrix_between_numbers(curvature, monkeypatch):
     """By differences: to first order in how long these are."""
-    numbers = single_numbers(curvature.parameters)
+    numbers = Numbers(curvature.scene, curvature.parameters).places
     assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
     rows = [row for number in numbers for row in curvature.places(number.name)]
     wanted = curvature.matrix[rows][:, rows]
@@ -92,7 +91,7 @@ def diagonal_by(curvature, probes, monkeypatch):
     monkeypatch.setattr(tuning, "PROBES", probes)
     monkeypatch.setattr(tuning, "POWER", 1.0)
     point = Point(curvature.scene, curvature.values, curvature.weights, {})
-    return find_diagonals(point, [curvature.parameters[1]], SolveMemory())["density"]
+    return find_diagonals(point, [curvature.parameters[1]])["density"]
 
 
 @pytest.mark.slow

@@ -58,8 +58,7 @@ def finished(folder, medium, parameters, phase="g: 0.3", start=()):
         job.step()
         for parameter in job.run.parameters:
             limit = 0.9 if parameter.name in ("albedo", "phase.weight") else torch.inf
-            state = parameter.state()
-            parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
+            parameter.value = moved(parameter.value.detach()).clamp(max=limit)
         job.finish()
     return job.run.current_scene()
 
