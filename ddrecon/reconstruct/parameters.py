@@ -78,7 +78,7 @@ def _rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
 
 
 class Parameter:
-    """The value of one variable, and the optimizer that moves it within its bounds.
+    """The value of one variable, its bounds, and how much its changes count.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. `view` is the
