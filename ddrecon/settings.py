@@ -57,7 +57,7 @@ class DiffusionSettings:
     transport_tolerance: Rounds end where one changes light by less of it, at most
         `transport_rounds` of them, left out 16. `render.json` has how many there were, and their
         residual.
-    degree: Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; of a
+    degree: Degree to which such sweeps keep light's angles, along 44 directions, 96 for 7; of a
         single round 18 for 1, 26 for 3. Left out: by the medium.
     refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
     refine_along: The axes along which cells are divided.

@@ -5,13 +5,16 @@ degree l and order m, from -l to l; the polar axis is z. The mean square of each
 1, so the sum over m of Y_lm(a) Y_lm(b) is (2l + 1) P_l(a . b), with Legendre's polynomials P_l. For
 l = 1 they are sqrt(3) times y, z and x.
 
-Directions and weights that integrate over the sphere are Lebedev's rules and two more. They are
-exact for polynomials up to some degree, and symmetric under every rotation and reflection of the
-cube, so no axis of the grid is preferred. Sources: Lebedev 1975, doi:10.1016/0041-5553(75)90133-0,
-and 1976, doi:10.1016/0041-5553(76)90100-2. That of 18 points follows from the means of x^4 and of
-x^2 y^2 alone. That of 44 points is exact for the flux through a face as well: the mean of |x|, of
-which Lebedev's rules lack 11, 8, 1 and 1 percent. It has the means of x^4, x^2 y^2 z^2 and |x|, and
-those of degree 8 and 10 within 0.4 and 1.3 percent.
+Directions and weights that integrate over the sphere are Lebedev's rules of 26 and 50 points and
+three more. They are exact for polynomials up to some degree, and symmetric under every rotation and
+reflection of the cube, so no axis of the grid is preferred. Sources: Lebedev 1975,
+doi:10.1016/0041-5553(75)90133-0, and 1976, doi:10.1016/0041-5553(76)90100-2. That of 18 points
+follows from the means of x^4 and of x^2 y^2 alone.
+
+Light at a face differs from side to side, so sweeps want integrals over half the sphere as well, of
+which Lebedev's rules lack 11, 8 and 1 percent of |x|. That of 44 points has the mean of |x|, and
+those of x^4 and x^2 y^2 z^2. That of 96 points, none of which lies within a face, has the means of
+x^4, x^6, |x|, |x y|, |x|^3 and |x|^5.
 """
 
 import math
@@ -42,22 +45,20 @@ _ORBITS = {
         ((3**-0.5, 3**-0.5, 3**-0.5), 27 / 1280),
         ((11**-0.5, 11**-0.5, 3 * 11**-0.5), 14641 / 725760),
     ),
-    86: (
-        ((0.0, 0.0, 1.0), 0.01154401154401154),
-        ((3**-0.5, 3**-0.5, 3**-0.5), 0.01194390908585628),
+    96: (
         (
-            (0.3696028464541502, 0.3696028464541502, (1 - 2 * 0.3696028464541502**2) ** 0.5),
-            0.01111055571060340,
+            (0.6987095200040837, 0.6987095200040837, (1 - 2 * 0.6987095200040837**2) ** 0.5),
+            0.011806239117329272,
         ),
         (
-            (0.6943540066026664, 0.6943540066026664, (1 - 2 * 0.6943540066026664**2) ** 0.5),
-            0.01187650129453714,
+            (0.4332614506133654, 0.4332614506133654, (1 - 2 * 0.4332614506133654**2) ** 0.5),
+            0.01484756804080873,
         ),
-        ((0.0, 0.3742430390903412, (1 - 0.3742430390903412**2) ** 0.5), 0.01181230374690448),
+        ((0.05502664829054827, 0.2961641115400204, 0.953550673542638), 0.007506429754264332),
     ),
 }
 """By number of points, the coordinates of one of each orbit and its weight."""
-DEGREES = {18: 5, 26: 7, 44: 7, 50: 11, 86: 15}
+DEGREES = {18: 5, 26: 7, 44: 7, 50: 11, 96: 7}
 """The degree up to which the rule of so many points is exact."""
 
 

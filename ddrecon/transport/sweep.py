@@ -23,8 +23,8 @@ from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
 from ddrecon.transport.mirror import Mirror
 
-DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
-"""By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
+DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 96}
+"""By the degree to which angles are kept. Both rules are exact for fluxes through faces."""
 OF_ONE_ROUND = {1: 18, 3: 26}
 """Fewer, where there is one round: what they lack is about what that has not yet brought back."""
 

@@ -132,8 +132,18 @@ def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count):
     assert max(error(count, powers) for powers in monomials if sum(powers) == top) > 1e-5
 
 
-def test_the_flux_through_a_face_is_exact_with_44_directions():
-    """As half the sphere has it: the mean of |x| is 1/2."""
-    directions, weights = RULES[44]
-    flux = weights @ directions.abs()
-    torch.testing.assert_close(flux, torch.full_like(flux, 0.5), rtol=1e-14, atol=0)
+FLUX = 1, 0, 0
+
+
+@pytest.mark.parametrize(
+    ("count", "powers"), [(44, [FLUX]), (96, [FLUX, (1, 1, 0), (3, 0, 0), (5, 0, 0)])]
+)
+def test_light_at_a_face_is_integrated_from_each_side(count, powers):
+    """Means of |x^a y^b|: the flux through a face, and more where light is peaked."""
+    directions, weights = RULES[count]
+    for exponents in powers:
+        mean = float(weights @ (directions.abs() ** torch.tensor(exponents)).prod(1))
+        gammas = math.prod(math.gamma((power + 1) / 2) for power in exponents)
+        exact = gammas / (2 * math.pi * math.gamma((sum(exponents) + 3) / 2))
+        assert mean == pytest.approx(exact, rel=1e-14)
+    assert count == 44 or directions.abs().min() > 0.05  # none lies within a face

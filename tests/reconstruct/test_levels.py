@@ -71,7 +71,7 @@ def test_noise_of_averaged_pictures_is_less(ball_scene):
     for level in range(len(frame.problem.factors)):
         frame.enter(level)
         (shown,) = frame.level.train.views
-        loss = float(shown.image.square().mean()) / frame.problem.power
+        loss = float(shown.image.square().mean()) / frame.problem.unit
         assert frame.noise_loss() == pytest.approx(loss, rel=0.1)
 
 
