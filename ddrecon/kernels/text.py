@@ -87,9 +87,13 @@ class TextKernel:
         @wp.func_native(begin + "".join(variables) + text)
         def do_item(item: int, record: Record): ...
 
-        own = {"module": "unique", "name": name, "cuda_max_registers": MOST_REGISTERS}
-
-        @wp.kernel(enable_backward=False, module_options=options, **own)
+        @wp.kernel(
+            enable_backward=False,
+            module="unique",
+            name=name,
+            module_options=options,
+            cuda_max_registers=MOST_REGISTERS,
+        )
         def do_items(first: int, record: Record):
             do_item(first + wp.tid(), record)
 
