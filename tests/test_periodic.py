@@ -121,22 +121,22 @@ def test_engines_tangents_and_adjoints_agree(kind, monkeypatch):
 def test_the_balance_of_a_period_is_half_of_that_of_two(kind):
     """Nothing leaves by its sides, and by its faces enters what falls on them."""
     density, settings = half_empty(*SHAPE), KINDS[kind]
-    one = find_balance(repeated(density, **settings))
-    two = find_balance(repeated(torch.cat([density, density]), (2, 3), **settings))
+    balance = find_balance(repeated(density, **settings))
+    doubled = find_balance(repeated(torch.cat([density, density]), (2, 3), **settings))
     area, travel = SHAPE[0] * SHAPE[2] * CELL**2, settings.get("travel")
     falling = -3 * travel[1] / math.hypot(*travel) if travel else 2 * math.pi * 0.3
-    assert one["enters"] == pytest.approx({"lights.0": falling * area})
-    assert one["leaves"].keys() == {"-y", "+y"}
-    assert two["absorbed"] == pytest.approx(2 * one["absorbed"], rel=1e-8)
-    for face, power in one["leaves"].items():
-        assert two["leaves"][face] == pytest.approx(2 * power, rel=1e-8)
-    assert abs(one["defect_percent"]) < 5
+    assert balance["enters"] == pytest.approx({"lights.0": falling * area})
+    assert balance["leaves"].keys() == {"-y", "+y"}
+    assert doubled["absorbed"] == pytest.approx(2 * balance["absorbed"], rel=1e-8)
+    for face, power in balance["leaves"].items():
+        assert doubled["leaves"][face] == pytest.approx(2 * power, rel=1e-8)
+    assert abs(balance["defect_percent"]) < 5
 
 
 def test_a_ground_sends_back_its_part_of_all_that_leaves_a_period_downwards():
-    one = find_balance(repeated(half_empty(2, 3, 2), **KINDS["ground"]))
-    assert one["into_ground"] == pytest.approx(one["leaves"]["-y"])
-    assert one["enters"]["ground"] == pytest.approx(0.5 * one["into_ground"], rel=0.06)
+    balance = find_balance(repeated(half_empty(2, 3, 2), **KINDS["ground"]))
+    assert balance["into_ground"] == pytest.approx(balance["leaves"]["-y"])
+    assert balance["enters"]["ground"] == pytest.approx(0.5 * balance["into_ground"], rel=0.06)
 
 
 def even(*shape):

@@ -43,7 +43,7 @@ class Mirror:
     directions: list[Direction]
     values: Tensor
     besides: Mirror | None = None
-    left: list[Ends] = field(default_factory=list)
+    outgoing: list[Ends] = field(default_factory=list)
     before: list[Ends] = field(default_factory=list)
     more: list[Tensor] = field(default_factory=list)
     swept: list[Tensor] = field(default_factory=list)
@@ -64,7 +64,7 @@ class Mirror:
 
         None stands for what the last sweep has found.
         """
-        self.before, self.left = self.left, []
+        self.before, self.outgoing = self.outgoing, []
         if light is None:
             self.more = [torch.zeros_like(layer) for layer in self.more]
             return
@@ -81,7 +81,10 @@ class Mirror:
             image = self.images[number][axis]
             layer = self.more[2 * axis + (direction[axis] < 0)]
             layer = lay_face(torch.tensordot(self.values[image].to(layer), layer, 1), place, course)
-            for earlier in (self.before, self.besides.left if self.besides and self.before else []):
+            for earlier in (
+                self.before,
+                self.besides.outgoing if self.besides and self.before else [],
+            ):
                 if earlier and course.moved[axis]:
                     layer = layer + earlier[image][place]
             ends.append(self.reflected[number][axis] * layer)
@@ -96,7 +99,7 @@ class Mirror:
         axes = Characteristic.of(self.grid, self.directions[number]).axes
         gone = (
             (1 - self.reflected[number][axis]) * layer
-            for axis, layer in zip(axes, self.left[number], strict=True)
+            for axis, layer in zip(axes, self.outgoing[number], strict=True)
         )
         across, rows, columns = gone
         return across, rows, columns

@@ -69,7 +69,7 @@ def sweep(
 
         radiance, gone = recompute(follow)
         if mirror is not None:
-            mirror.left.append(gone)
+            mirror.outgoing.append(gone)
         moments.addr_(weight * row, radiance.flatten())
     return moments.view(count, *shape)
 

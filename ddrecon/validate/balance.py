@@ -74,8 +74,10 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
     swept = _sweep_out(light_field, DIRECTIONS[settings.angles], medium.index**2 * ambient, box.up)
-    _, reflected, left = reduce(torch.add, crossings.values(), box.nothing)
-    left = reduce(torch.add, (_leave_turned(b, box) for b in light_field.turned), left + swept)
+    _, reflected, outflow = reduce(torch.add, crossings.values(), box.nothing)
+    outflow = reduce(
+        torch.add, (_leave_turned(b, box) for b in light_field.turned), outflow + swept
+    )
     lost = cells.absorption.value * fluence_of(light_field, settings)
     powers: dict[str, Any] = {"enters": enters}
     if medium.index != 1:
@@ -83,13 +85,13 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     powers["absorbed"] = cell * lost.sum((1, 2, 3), dtype=torch.float64)
     powers["leaves"] = {
         face: power
-        for face, power in zip(FACES, left.sum(0), strict=True)
+        for face, power in zip(FACES, outflow.sum(0), strict=True)
         if "zyx".index(face[1]) not in medium.grid.periodic
     }
     if lit:
-        powers["into_ground"] = left[0].sum(0)
+        powers["into_ground"] = outflow[0].sum(0)
     entered = reduce(torch.add, enters.values())
-    defect = 100 * (1 - (powers["absorbed"] + (reflected + left).sum((0, 1))) / entered)
+    defect = 100 * (1 - (powers["absorbed"] + (reflected + outflow).sum((0, 1))) / entered)
     return {
         **_plain(powers, torch.ones_like(entered)),
         "fractions": _plain(powers, entered),
@@ -242,7 +244,7 @@ def _sweep_out(light_field: LightField, directions: int, inflow: Tensor, up: int
             rise = gradient.expand(3, *emitted.shape)
             _, out = radiance_along(grid, cells.extinction.value, emitted, rise, direction, ends)
             if mirror is not None:
-                mirror.left.append(out)
+                mirror.outgoing.append(out)
                 out = mirror.released(number)
             gone = power.new_zeros(len(FACES), out[0].shape[-3])
             course = Characteristic.of(grid, direction)

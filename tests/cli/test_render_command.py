@@ -133,8 +133,8 @@ def test_a_balance_is_printed_and_a_record(succeed):
     assert set(record["leaves"]) == {sign + axis for sign in "-+" for axis in "xyz"}
     entered = np.array([*record["enters"].values()]).sum(0)
     assert np.allclose(record["fractions"]["absorbed"], record["absorbed"] / entered)
-    left = np.array([*record["leaves"].values()]).sum(0)
-    defect = 100 * (1 - (np.array(record["absorbed"]) + left) / entered)
+    outflow = np.array([*record["leaves"].values()]).sum(0)
+    defect = 100 * (1 - (np.array(record["absorbed"]) + outflow) / entered)
     assert np.allclose(defect, record["defect_percent"])
     assert "neither absorbed nor left" in succeed("balance", "scene.yaml").stdout
 

@@ -47,15 +47,17 @@ def test_sections_and_mean_cosine_are_those_of_both_weighed_by_how_much_each_sca
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("one, other", [(SMOKE, DUST), (DUST, SMOKE)])
-def test_beside_nothing_a_medium_is_as_it_is_alone(one, other):
-    nothing = replace(other, density=torch.zeros(SHAPE, dtype=torch.float64))
+@pytest.mark.parametrize("volume, absent", [(SMOKE, DUST), (DUST, SMOKE)])
+def test_beside_nothing_a_medium_is_as_it_is_alone(volume, absent):
+    nothing = replace(absent, density=torch.zeros(SHAPE, dtype=torch.float64))
     images = [
         render(scene_of(mix_media(media)))
-        for media in ({"one": one, "none": nothing}, {"none": nothing, "one": one})
+        for media in ({"volume": volume, "none": nothing}, {"none": nothing, "volume": volume})
     ]
-    fields = (sigma.view(-1, 1, 1, 1) * one.density for sigma in (one.sigma_a, one.sigma_s))
-    alone = Volume(one.grid, torch.ones_like(one.density), *fields, one.phase)
+    fields = (
+        sigma.view(-1, 1, 1, 1) * volume.density for sigma in (volume.sigma_a, volume.sigma_s)
+    )
+    alone = Volume(volume.grid, torch.ones_like(volume.density), *fields, volume.phase)
     for image in images:
         torch.testing.assert_close(image, render(scene_of(alone)), rtol=2e-4, atol=1e-6)
 

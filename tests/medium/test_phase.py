@@ -66,7 +66,7 @@ TWO = TwoLobe(tensor(0.6, -0.3), scalar(0.4))
 
 
 @pytest.mark.parametrize(
-    "one, other",
+    "special, general",
     [
         (TwoLobe(tensor(0.6, -0.9), scalar(1.0)), HenyeyGreenstein(scalar(0.6))),
         (TwoLobe(tensor(0.6, -0.9), scalar(0.0)), HenyeyGreenstein(scalar(-0.9))),
@@ -74,12 +74,12 @@ TWO = TwoLobe(tensor(0.6, -0.3), scalar(0.4))
         (Tabulated(1 + even_angles(STEPS).cos()[None] ** 2), Rayleigh(scalar(0.0))),
     ],
 )
-def test_special_cases_are_each_other(one, other):
+def test_special_cases_are_each_other(special, general):
     cosine = torch.linspace(-1, 1, 37, dtype=torch.float64)
-    torch.testing.assert_close(one.value(cosine), other.value(cosine), rtol=1e-7, atol=1e-7)
-    torch.testing.assert_close(one.moments(30), other.moments(30), rtol=0, atol=1e-10)
+    torch.testing.assert_close(special.value(cosine), general.value(cosine), rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(special.moments(30), general.moments(30), rtol=0, atol=1e-10)
     for degree in (1, 3):
-        tails = (phase.peak_tail(degree, 1) for phase in (one, other))
+        tails = (phase.peak_tail(degree, 1) for phase in (special, general))
         torch.testing.assert_close(*tails, rtol=0, atol=1e-10)
 
 
@@ -104,16 +104,16 @@ def test_all_that_is_asked_has_both_derivatives(name):
 # --- what a forward peak does to a beam ----------------------------------------------------------
 
 
-def peak_moment(g, depth, degree, kept):
+def peak_moment(g, depth, degree, top):
     """The moment of light that the forward peak alone has scattered, on a way of `depth`.
 
     n scatterings fall on it with Poisson's probability, each is the one in question with 1 / n,
-    and n in a row have the moments of one to the power of n: 1 up to `kept`, then g, g^2, ...
+    and n in a row have the moments of one to the power of n: 1 up to `top`, then g, g^2, ...
     """
     counts = range(1, 80)
     chances = [math.exp(-depth) * depth ** (n - 1) / math.factorial(n) for n in counts]
-    return g ** (kept + 1) * sum(
-        chance * g ** (n * max(0, degree - kept - 1))
+    return g ** (top + 1) * sum(
+        chance * g ** (n * max(0, degree - top - 1))
         for chance, n in zip(chances, counts, strict=True)
     )
 

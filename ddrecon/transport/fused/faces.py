@@ -47,7 +47,7 @@ def sweep_fused(
         moments = moments + chunk_moments
         gone |= zip(numbers, leaving, strict=bool(leaving))
     if mirror is not None:
-        mirror.left.extend(gone[n] for n in range(directions))
+        mirror.outgoing.extend(gone[n] for n in range(directions))
     return moments
 
 
