@@ -58,8 +58,6 @@ _ORBITS = {
     ),
 }
 """By number of points, the coordinates of one of each orbit and its weight."""
-DEGREES = {18: 5, 26: 7, 44: 7, 50: 11, 96: 7}
-"""The degree up to which the rule of so many points is exact."""
 
 
 def count_harmonics(degree: int) -> int:
@@ -112,7 +110,7 @@ def norm(ell: int, m: int) -> float:
 def sphere_quadrature(like: Tensor, count: int = 50) -> tuple[Tensor, Tensor]:
     """Unit directions `[count, 3]` and weights `[count]` whose sum is 1.
 
-    The weighted sum over the directions is the mean over the sphere. `count`: a key of `DEGREES`.
+    The weighted sum over the directions is the mean over the sphere. `count`: 18, 26, 44, 50 or 96.
     """
     directions: list[tuple[float, ...]] = []
     weights: list[float] = []
