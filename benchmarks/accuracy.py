@@ -22,7 +22,7 @@ import json
 import math
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -49,14 +49,14 @@ from ddrecon.variables.values import with_values
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Density at x, y and z, each from -0.5 to 0.5 across the box."""
 Vector = tuple[float, float, float]
+KnownCase = tuple[str, Path, Traced]
+"""A name, a scene file that holds until the next one is written, and its path-traced image."""
 CELLS, PIXELS = 48, 32
 LIGHT = ("direction", "irradiance", "radiance")
 """What is taken of the lights of the eleven cases."""
 MODELS = {
     "n = 0": ("diffusion.transport_rounds=0",),
-    "n = 1": ("diffusion.transport_rounds=1", "diffusion.degree=3"),
-    "n = 2": ("diffusion.transport_rounds=2", "diffusion.degree=3"),
-    "n = 3": ("diffusion.transport_rounds=3", "diffusion.degree=3"),
+    **{f"n = {n}": (f"diffusion.transport_rounds={n}", "diffusion.degree=3") for n in (1, 2, 3)},
     "n = 2, L = 5": ("diffusion.transport_rounds=2", "diffusion.degree=5"),
     "default": (),
 }
@@ -148,13 +148,11 @@ class Case:
         write_field(folder / "density.npz", "density", density.numpy(), bounds)
         medium = {"sigma_t": self.sigma_t, "albedo": self.albedo, "g": self.g}
         camera = {**(self.camera or perspective(FRONT)), "target": [0, 0, 0], "up": [0, 1, 0]}
-        path = write_scene(
-            folder, folder / "density.npz", bounds, medium, list(self.light), camera, PIXELS
+        ground = dict(zip(("height", "albedo"), self.ground, strict=True)) if self.ground else None
+        density = folder / "density.npz"
+        return write_scene(
+            folder, density, bounds, medium, list(self.light), camera, PIXELS, ground
         )
-        if self.ground is not None:
-            ground = dict(zip(("height", "albedo"), self.ground, strict=True))
-            path.write_text(json.dumps({**json.loads(path.read_text()), "ground": ground}))
-        return path
 
 
 def write_scene(
@@ -165,12 +163,13 @@ def write_scene(
     lights: list[dict[str, Any]],
     camera: dict[str, Any],
     pixels: int,
+    ground: dict[str, float] | None = None,
 ) -> Path:
     """A scene file of one square view, 16 rays a pixel."""
     low, high = bounds.tolist()
     volume = {"bounds": {"min": low, "max": high}, "density": {"file": str(density)}, **medium}
     view = {"name": "view", "camera": {**camera, "resolution": [pixels] * 2}}
-    scene = {"volume": volume, "lights": lights, "views": [view]}
+    scene = {"volume": volume, "ground": ground, "lights": lights, "views": [view]}
     path = folder / "scene.yaml"
     path.write_text(json.dumps({**scene, "render": {"samples_per_pixel": 16}}))
     return path
@@ -246,9 +245,8 @@ def trace(name: str, scene: Scene, folder: Path) -> Traced:
     return Traced.of(images)
 
 
-def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
-    """The name, scene file and path-traced image of each of the eleven cases."""
-    cases = []
+def known_cases(folder: Path, place: Path) -> Iterator[KnownCase]:
+    """The eleven cases, their scene files in `place`."""
     for case in json.loads((folder / "images" / "cases.json").read_text()):
         full = np.load(folder / "images" / f"{case['case']}.npz")["full"]
         noise = case["noise_full"] / math.sqrt((full**2).mean())
@@ -258,29 +256,30 @@ def known_cases(folder: Path, place: Path) -> list[tuple[str, Path, Traced]]:
         lights = []
         for light in case["light"]:
             kind = "ambient" if light["type"] == "constant" else light["type"]
-            numbers = {key: light[key] for key in light if key in LIGHT}
-            lights.append({"type": kind} | numbers)
-        case_folder = place / case["case"]
-        case_folder.mkdir()
+            lights.append({"type": kind} | {key: light[key] for key in light if key in LIGHT})
         density = folder / "images" / f"{case['volume']}_density.npz"
         camera["type"] = "perspective"
-        path = write_scene(case_folder, density, bounds, medium, lights, camera, case["resolution"])
-        cases.append((case["case"], path, Traced(full, noise)))
-    return cases
+        path = write_scene(place, density, bounds, medium, lights, camera, case["resolution"])
+        yield case["case"], path, Traced(full, noise)
 
 
-def print_eleven(folder: Path, place: Path) -> None:
-    """Errors of the eleven cases, their mean and the worst."""
+def own_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> Iterator[KnownCase]:
+    """The same of `cases` of ours."""
+    for case in cases:
+        path = case.write(place)
+        yield case.name, path, trace(case.name, load_scene(path), folder / "traced")
+
+
+def print_errors(cases: Iterable[KnownCase]) -> None:
+    """Errors of all models beside the noise of what they are compared with; mean and worst."""
     print_header("case", "noise", *MODELS)
-    errors = []
-    for name, path, traced in known_cases(folder, place):
-        found = [
-            traced.error(image_of(load_scene(path, overrides=model))) for model in MODELS.values()
-        ]
-        print_row(name, traced.noise, *(error_text(error, traced.noise) for error in found))
-        errors.append(found)
+    rows = []
+    for name, path, traced in cases:
+        errors = [traced.error(image_of(load_scene(path, overrides=m))) for m in MODELS.values()]
+        print_row(name, traced.noise, *(error_text(error, traced.noise) for error in errors))
+        rows.append(errors)
     for name, kind in (("mean", np.mean), ("worst", np.max)):
-        print_row(name, "", *(f"{error:.4f}" for error in kind(errors, axis=0)))
+        print_row(name, "", *(f"{error:.4f}" for error in kind(rows, axis=0)))
 
 
 def print_derivatives(folder: Path, place: Path) -> None:
@@ -299,19 +298,6 @@ def print_derivatives(folder: Path, place: Path) -> None:
             ratios.append(float((slope * density).sum()) / true[name][0])
         doubt = true[name][1] / true[name][0]
         print_row(name, f"{doubt:.2f}", *(f"{ratio:.2f}" for ratio in ratios))
-
-
-def print_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> None:
-    """Errors of `cases`, beside the noise of what they are compared with."""
-    print_header("case", "noise", *MODELS)
-    for case in cases:
-        path = case.write(place)
-        traced = trace(case.name, load_scene(path), folder / "traced")
-        errors = (
-            error_text(traced.error(image_of(load_scene(path, overrides=model))), traced.noise)
-            for model in MODELS.values()
-        )
-        print_row(case.name, traced.noise, *errors)
 
 
 THICK_CELLS, FINER = 12, 6
@@ -374,14 +360,15 @@ def main() -> None:
     parser.add_argument("--references", type=Path, default=Path("references"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
+        references, place = given.references, Path(name)
         if given.what == "eleven":
-            print_eleven(given.references, Path(name))
+            print_errors(known_cases(references, place))
         elif given.what == "derivative":
-            print_derivatives(given.references, Path(name))
+            print_derivatives(references, place)
         elif given.what == "thick":
-            print_thick(Path(name))
+            print_thick(place)
         else:
-            print_cases(CASES[given.what], given.references, Path(name))
+            print_errors(own_cases(CASES[given.what], references, place))
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from figures import ddrecon, print_header, print_row
+from figures import ROOT, ddrecon, print_header, print_row
+from inverse_scenes import coarsened
 from path_replay import Replay, why_not
-from reconstruction import ROOT, coarsened
 from torch import Tensor
 from torch.nn.functional import interpolate
 

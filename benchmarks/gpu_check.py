@@ -27,7 +27,8 @@ from statistics import median
 from typing import Any
 
 import torch
-from speed import start_run
+from figures import ROOT
+from runs import CONFIGS, start_config, start_paper_case, start_plume, start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
@@ -35,17 +36,13 @@ from ddrecon.bench import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError, SceneError, UsageError
-from ddrecon.io.volumes.table import read_field
 from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import scene_at_level
-from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
-ROOT = Path(__file__).parents[1]
-CONFIGS = ROOT / "configs"
 CELLS = 3000
 """Scenes are compared in at most about so many cells."""
 AGREEMENT = 1e-9
@@ -88,10 +85,10 @@ class Check:
             "64 x 96 x 64, 512^2, no round (the paper: 22.5/s)": lambda: self.plume(64, 512, 0),
             "64 x 96 x 64, 1024^2, no round (the paper: 16.5/s)": lambda: self.plume(64, 1024, 0),
             "64 x 96 x 64, 512^2, a round": lambda: self.plume(64, 512, 1),
-            "plume.yaml, 16 x 24 x 16": lambda: self.config_plume(4 * n),
-            "plume.yaml, 32 x 48 x 32": lambda: self.config_plume(2 * n),
-            "plume.yaml, 64 x 96 x 64": lambda: self.config_plume(n),
-            "capture.yaml, full resolution": self.capture,
+            "plume.yaml, 16 x 24 x 16": lambda: start_plume(self.device, 4 * n),
+            "plume.yaml, 32 x 48 x 32": lambda: start_plume(self.device, 2 * n),
+            "plume.yaml, 64 x 96 x 64": lambda: start_plume(self.device, n),
+            "capture.yaml, full resolution": lambda: start_config("capture", self.device, n),
             "168 x 252 x 168, 512^2, RGB fields, a round (the paper: 8 s)": self.joint,
             "256 x 384 x 256, 512^2, a round": lambda: self.plume(256 // n, 512, 1),
         }
@@ -99,9 +96,7 @@ class Check:
     def plume(self, cells: int, pixels: int, rounds: int) -> Reconstruction:
         """The plume of `bench`, from its own image."""
         sizes = cells // self.shrink, pixels // self.shrink
-        scene = plume_scene(*sizes, torch.float32, self.device)
-        settings = replace(scene.diffusion, transport_rounds=rounds)
-        return start_run(replace(scene, diffusion=settings))
+        return start_paper_case(*sizes, rounds, self.device)
 
     def joint(self) -> Reconstruction:
         """The paper's joint case: density, sigma_a and sigma_s in three colors."""
@@ -113,21 +108,6 @@ class Check:
             for name in ("sigma_a", "sigma_s")
         }
         return start_run(replace(scene, volume=replace(volume, **fields)), ("density", *fields))
-
-    def config_plume(self, factor: int) -> Reconstruction:
-        """`configs/plume.yaml` from half the truth, so many times coarser, by three views."""
-        scene = self.load("plume")
-        density = torch.tensor(read_field(ROOT / "data/plume/density.npz", "density").values)
-        views = [view for view in scene.views if not view.is_test][:3]
-        starts = {"density": 0.5 * density.to(scene.volume.density)}
-        return Reconstruction(scene_at_level(replace(scene, views=views, starts=starts), factor))
-
-    def capture(self) -> Reconstruction:
-        return Reconstruction(scene_at_level(self.load("capture"), self.shrink))
-
-    def load(self, name: str) -> Scene:
-        path = CONFIGS / f"{name}.yaml"
-        return load_scene(path, device=self.device)
 
 
 def machine(check: Check) -> Iterator[str]:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from figures import ddrecon
 from numpy.typing import NDArray
-from reconstruction import coarsened
 
 Array = NDArray[np.float64]
 View = dict[str, Any]
@@ -72,6 +71,15 @@ class Case:
         scene |= {"volume": volume, "views": views, "render": {"background": False}}
         scene["optimize"] = {"iterations": "auto", "parameters": sought}
         (folder / "scene.yaml").write_text(json.dumps(scene, indent=1))
+
+
+def coarsened(density: Array, shape: Sequence[int]) -> Array:
+    """Means of `density` over the cells of a grid of `shape`."""
+    for axis, (count, own) in enumerate(zip(shape, density.shape, strict=True)):
+        parts = np.repeat(density, math.lcm(count, own) // own, axis)
+        parts = parts.reshape(*parts.shape[:axis], count, -1, *parts.shape[axis + 1 :])
+        density = parts.mean(axis + 1)
+    return density
 
 
 def render_views(scene: Path) -> list[Array]:

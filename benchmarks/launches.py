@@ -1,11 +1,8 @@
 """What an iteration of a reconstruction asks of the machine: calls, launches, waits.
 
-    python benchmarks/launches.py [--plume] [--config NAME] [--modules] [--as-a-gpu]
+    python benchmarks/launches.py [CASE]... [--as-a-gpu] [--engine warp] [--device cpu]
 
-Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
-another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full
-resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels, and `--config`
-another one of `configs` as it is. `--as-a-gpu` makes a GPU's choices on a processor
+Prints a table in Markdown, a row for each case. `--as-a-gpu` makes a GPU's choices on a processor
 (`tests/as_on_a_gpu.py`), which takes some minutes.
 
 A call is an operation of torch, which on a GPU costs at least 5 microseconds; not counted are views
@@ -22,29 +19,19 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from types import FrameType
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from speed import start_run
+from figures import ROOT, print_header, print_row
+from runs import start_config, start_paper_case, start_plume
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import ddrecon
-from ddrecon.bench import plume_scene
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.scene import Scene
-from ddrecon.scene_file.build import load_scene
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = Path(ddrecon.__file__).parent
-HELPERS = "kernels", "numerics"
-"""Rooms whose calls count for whoever asked."""
 CONVERSIONS = (
     *((Tensor, name, "read") for name in ("tolist", "numpy", "__array__")),
     *((torch, name, "write") for name in ("tensor", "as_tensor")),
@@ -57,25 +44,24 @@ INDEXED = "index", "index_put", "index_put_", "_index_put_impl_"
 """Operations that take indices, or masks, whose sum is a size."""
 WARM_UP = 2
 """Iterations before the one that is counted."""
-FEWEST = 10
-"""Modules with fewer calls and launches than this, and no reads, stand in one line."""
+CASES: dict[str, tuple[str, Callable[[str], Reconstruction]]] = {
+    "paper": (
+        "64 x 96 x 64, 512^2, no round: the paper's case",
+        lambda device: start_paper_case(64, 512, 0, device),
+    ),
+    "round": ("the same with a round", lambda device: start_paper_case(64, 512, 1, device)),
+    "plume": ("`plume.yaml`, three views, a round", start_plume),
+    "fire": ("`fire.yaml`, eight views", partial(start_config, "fire")),
+    "capture": (
+        "`capture.yaml`, four views, whose cameras are sought",
+        partial(start_config, "capture"),
+    ),
+}
+"""What is counted: the paper's own case, and configs."""
 
 
-@dataclass
-class Counts:
-    """How many of each kind come from each module: `call`, `launch`, `read`, `write`."""
-
-    of: Counter[tuple[str, str]] = field(default_factory=Counter)
-
-    def add(self, kind: str) -> None:
-        self.of[kind, origin()] += 1
-
-    def total(self, *kinds: str, module: str | None = None) -> int:
-        return sum(
-            count
-            for (kind, place), count in self.of.items()
-            if kind in kinds and module in (None, place)
-        )
+Counts = Counter[str]
+"""How many there are of each kind: `call`, `launch`, `read`, `write`."""
 
 
 class Operations(TorchDispatchMode):
@@ -89,9 +75,9 @@ class Operations(TorchDispatchMode):
         self, function: Any, types: Any, arguments: Any = (), options: Any = None
     ) -> Any:
         if is_read(function, arguments):
-            self.counts.add("read")
+            self.counts["read"] += 1
         if not is_free(function):
-            self.counts.add("call")
+            self.counts["call"] += 1
         return function(*arguments, **(options or {}))
 
 
@@ -105,7 +91,7 @@ def conversions_counted(counts: Counts) -> Iterator[None]:
     def counted(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
             if kind == "read" or not isinstance(arguments[-1], Tensor):
-                counts.add(kind)
+                counts[kind] += 1
             return function(*arguments, **options)
 
         return call
@@ -135,30 +121,6 @@ def is_read(function: Any, arguments: Sequence[Any]) -> bool:
     return name in READS
 
 
-def origin() -> str:
-    """The module of ddrecon that is at work; in a backward pass that whose derivative it is."""
-    frame: FrameType | None = sys._getframe(2)
-    while frame is not None:
-        # Derivatives that torch takes itself remember where their function was called.
-        if frame.f_code.co_name == "_engine_run_backward":
-            node = torch._C._current_autograd_node()
-            lines = node.metadata.get("traceback_", []) if node is not None else []
-            files = [line.split('"')[1] for line in reversed(lines) if line.count('"') > 1]
-            return next(filter(None, map(module_of, files)), "torch")
-        if name := module_of(frame.f_code.co_filename):
-            return name
-        frame = frame.f_back
-    return "torch"
-
-
-def module_of(file: str) -> str | None:
-    """A file's place in ddrecon; None for one elsewhere, and for helpers."""
-    if not file.startswith(f"{PACKAGE}/"):
-        return None
-    name = file.removeprefix(f"{PACKAGE}/")
-    return None if name.split("/")[0] in HELPERS else name
-
-
 @contextmanager
 def launches_counted(counts: Counts) -> Iterator[None]:
     """Counts launches of fused kernels, where there are any."""
@@ -171,38 +133,15 @@ def launches_counted(counts: Counts) -> Iterator[None]:
 
     def counted(*arguments: Any, **options: Any) -> Any:
         if not options.get("record_cmd"):
-            counts.add("launch")
+            counts["launch"] += 1
         return launch(*arguments, **options)
 
     def counted_again(*arguments: Any, **options: Any) -> Any:
-        counts.add("launch")
+        counts["launch"] += 1
         return launch_again(*arguments, **options)
 
     with patch.object(wp, "launch", counted), patch.object(wp.Launch, "launch", counted_again):
         yield
-
-
-def begin_plume(cells: int, pixels: int, rounds: int, device: str) -> Reconstruction:
-    """The gray plume of `bench`, from half its density; without `rounds` it is the paper's case."""
-    scene = plume_scene(cells, pixels, torch.float32, torch.device(device))
-    # A medium that is sought is received in whole cells, whatever this one deserves.
-    settings = replace(scene.diffusion, transport_rounds=rounds, receive=1)
-    return start_run(replace(scene, diffusion=settings))
-
-
-def load_config(name: str, rounds: int, device: str) -> Scene:
-    """The scene of a file in `configs`."""
-    overrides = [f"diffusion.transport_rounds={rounds}"]
-    return load_scene(ROOT / "configs" / f"{name}.yaml", overrides=overrides, device=device)
-
-
-def load(views: int, rounds: int, device: str) -> Scene:
-    """The plume at full resolution, from half its density."""
-    scene = load_config("plume", rounds, device)
-    density = torch.tensor(read_field(ROOT / "data" / "plume" / "density.npz", "density").values)
-    start = 0.5 * density.to(scene.volume.density)
-    seen = [view for view in scene.views if not view.is_test][:views]
-    return replace(scene, views=seen, starts={"density": start})
 
 
 def count(run: Reconstruction) -> Counts:
@@ -210,75 +149,33 @@ def count(run: Reconstruction) -> Counts:
     counts = Counts()
     for _ in range(WARM_UP):
         run.step()
-    remembered = torch.autograd.set_detect_anomaly(True, check_nan=False)
-    with remembered, launches_counted(counts), conversions_counted(counts), Operations(counts):
+    with launches_counted(counts), conversions_counted(counts), Operations(counts):
         run.step()
     return counts
-
-
-def print_totals(found: dict[tuple[str, int], Counts]) -> None:
-    print("| engine | transport rounds | calls | launches | both | reads | writes |")
-    print("|---|---|---|---|---|---|---|")
-    for (engine, rounds), counts in found.items():
-        kinds = ("call",), ("launch",), ("call", "launch"), ("read",), ("write",)
-        numbers = [str(counts.total(*kind)) for kind in kinds]
-        print(f"| {engine} | {rounds} | {' | '.join(numbers)} |")
-
-
-def print_modules(found: dict[tuple[str, int], Counts]) -> None:
-    last = list(found.values())[-1]
-    modules = {module for counts in found.values() for _, module in counts.of}
-
-    def weight(module: str) -> int:
-        return last.total("call", "launch", module=module)
-
-    def cell(counts: Counts, chosen: Sequence[str]) -> str:
-        calls, reads = (
-            sum(counts.total(*kinds, module=module) for module in chosen)
-            for kinds in (("call", "launch"), ("read",))
-        )
-        return f"{calls}, {reads}" if reads else f"{calls}"
-
-    few = [m for m in modules if weight(m) < FEWEST and not last.total("read", module=m)]
-    rows = [(f"`{module}`", [module]) for module in sorted(modules - set(few), key=weight)[::-1]]
-    print(f"\n| calls and launches, reads | {' | '.join(f'{e}, {r}' for e, r in found)} |")
-    print("|---|" + "---|" * len(found))
-    for name, chosen in [*rows, ("others", few)]:
-        print(f"| {name} | {' | '.join(cell(counts, chosen) for counts in found.values())} |")
 
 
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--views", type=int, default=3)
+    parser.add_argument("cases", nargs="*", choices=[[], *CASES], metavar="CASE")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--engines", nargs="+", default=ENGINES, choices=ENGINES)
-    parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
-    parser.add_argument("--plume", action="store_true")
-    parser.add_argument("--config")
-    parser.add_argument("--modules", action="store_true")
+    parser.add_argument("--engine", default="warp", choices=ENGINES)
     parser.add_argument("--as-a-gpu", action="store_true")
     options = parser.parse_args()
+    choices = nullcontext
     if options.as_a_gpu:
         sys.path.append(str(ROOT / "tests"))
-        from as_on_a_gpu import as_on_a_gpu
-    choices = as_on_a_gpu if options.as_a_gpu else nullcontext
+        from as_on_a_gpu import as_on_a_gpu as choices
     torch.set_num_threads(1)  # so that a kernel is one launch, as on a GPU
-    found = {}
-    for engine in options.engines:
-        use_engine(engine)
-        for rounds in options.rounds:
-            with choices():
-                if options.plume:
-                    run = begin_plume(64, 512, rounds, options.device)
-                elif options.config:
-                    run = Reconstruction(load_config(options.config, rounds, options.device))
-                else:
-                    run = Reconstruction(load(options.views, rounds, options.device))
-                found[engine, rounds] = count(run)
-    print_totals(found)
-    if options.modules:
-        print_modules(found)
+    use_engine(options.engine)
+    print_header("case", "calls", "launches", "both", "reads", "writes")
+    for name in options.cases or CASES:
+        what, begin = CASES[name]
+        with choices():
+            counts = count(begin(options.device))
+        calls, launches = counts["call"], counts["launch"]
+        numbers = calls, launches, calls + launches, counts["read"], counts["write"]
+        print_row(what, *(f"{number:,}" for number in numbers))
 
 
 if __name__ == "__main__":

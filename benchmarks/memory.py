@@ -1,10 +1,9 @@
 """Peak memory against what `ddrecon check` predicts.
 
-    python benchmarks/memory.py [--count]
+    python benchmarks/memory.py [--cells 64 96]
 
 Every figure is the highest resident size of a process of its own, less that of the same work on
-16^3 cells. With `--count` it is the most numbers a cell that tensors hold at once, and which
-allocation found that many: exact, in one process, and the same on every machine.
+16^3 cells.
 """
 
 from __future__ import annotations
@@ -14,14 +13,11 @@ import json
 import subprocess
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-import torch
 from figures import ddrecon, print_header, print_row
-from torch.multiprocessing.reductions import StorageWeakRef
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 SMALL = 16
 RGB = {"albedo": [0.95, 0.9, 0.8]}
@@ -66,60 +62,6 @@ def write_scene(folder: Path, cells: int, pixels: int, title: str, is_optimized:
     return path
 
 
-class Alive(TorchDispatchMode):
-    """Counts the bytes of all tensors that are alive, at their `peak`, and `where` that was."""
-
-    LEAST = 4096
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.known: dict[int, tuple[StorageWeakRef, int]] = {}
-        self.peak, self.where = 0, ""
-
-    def __torch_dispatch__(self, function, types, arguments=(), options=None):
-        made, is_new = function(*arguments, **(options or {})), False
-        for tensor in (leaf for leaf in tree_leaves(made) if isinstance(leaf, torch.Tensor)):
-            storage = tensor.untyped_storage()
-            known = self.known.get(storage._cdata)
-            if storage.nbytes() >= self.LEAST and (known is None or known[0].expired()):
-                self.known[storage._cdata] = StorageWeakRef(storage), storage.nbytes()
-                is_new = True
-        if is_new:
-            self.known = {key: one for key, one in self.known.items() if not one[0].expired()}
-            if (total := sum(size for _, size in self.known.values())) > self.peak:
-                self.peak, self.where = total, place()
-        return made
-
-
-def place() -> str:
-    """The innermost place in ddrecon that is being run."""
-    frame = sys._getframe()
-    while frame is not None and "/ddrecon/" not in frame.f_code.co_filename:
-        frame = frame.f_back
-    if frame is None:
-        return ""
-    return f"{frame.f_code.co_filename.partition('/ddrecon/')[2]}, `{frame.f_code.co_name}`"
-
-
-def count(folder: Path, cells: int, title: str) -> tuple[float, float, str]:
-    """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
-    from ddrecon.diffusion.implicit import SolveMemory
-    from ddrecon.picture import render_each
-    from ddrecon.reconstruct.loop import Reconstruction
-    from ddrecon.scene_file.build import load_scene
-
-    scene = load_scene(write_scene(folder, cells, 16, title, is_optimized=True))
-    with Alive() as render, torch.no_grad():
-        scene.volume.density = scene.volume.density.clone()
-        render_each(scene, scene.views, SolveMemory())
-    with Alive() as iteration:
-        search = Reconstruction(scene)
-        while not search.is_done:
-            search.step()
-    numbers = [mode.peak / 4 / cells**3 for mode in (render, iteration)]
-    return *numbers, iteration.where
-
-
 def measure(folder: Path, verb: str, cells: int, pixels: int, title: str) -> tuple[float, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
     path = write_scene(folder, cells, pixels, title, verb == "optimize")
@@ -133,26 +75,16 @@ def main() -> None:
     """Prints a table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
-    parser.add_argument("--count", action="store_true")
     options = parser.parse_args()
+    print_header("scene", "cells", "command", "peak [MiB]", "predicted / peak")
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        if options.count:
-            print_header("scene", "render", "iteration", "at its peak")
-            count(folder, 48, "gray")  # what is made once for a grid does not count
-            for title in CASES:
-                render, iteration, where = count(folder, 48, title)
-                print_row(title, f"{render:.0f}", f"{iteration:.0f}", where)
-            return
-        print_header("scene", "cells", "command", "peak [MiB]", "predicted / peak")
-        for title in CASES:
-            for verb in ("render", "optimize"):
-                base = measure(folder, verb, SMALL, 16, title)[0]
-                for cells in options.cells:
-                    taken, predicted = measure(folder, verb, cells, 256, title)
-                    used = taken - base
-                    figures = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
-                    print_row(title, f"{cells}^3", verb, *figures)
+        for title, verb in product(CASES, ("render", "optimize")):
+            base = measure(Path(name), verb, SMALL, 16, title)[0]
+            for cells in options.cells:
+                taken, predicted = measure(Path(name), verb, cells, 256, title)
+                used = taken - base
+                figures = f"{used / 2**20:.0f}", f"{predicted / used:.2f}"
+                print_row(title, f"{cells}^3", verb, *figures)
 
 
 if __name__ == "__main__":

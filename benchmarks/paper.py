@@ -1,10 +1,11 @@
 """Remakes the experiments of docs/experiments.md: runs them through the command line, draws their
-pictures, rewrites the table.
+pictures, prints a table.
 
-    python benchmarks/paper.py [NAME]... [-o FOLDER] [--keep]
+    python benchmarks/paper.py [NAME] [-o FOLDER] [--keep]
 
-NAME is that of a config in configs/paper; without one, all are remade, Fig. 8 too where Mitsuba can
-run. `--keep` draws finished runs again.
+NAME is that of a config in configs/paper, but for Fig. 8 and 13: `fig13` compares models, `fig08`
+derivatives with those of Mitsuba. Without one all others are remade, and Fig. 13 by the default
+model. `--keep` draws finished runs again.
 """
 
 from __future__ import annotations
@@ -13,18 +14,16 @@ import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import paper_gradients
 import torch
 import yaml
-from figures import as_options, ddrecon, keep, read_store
+from figures import ROOT, as_options, ddrecon, print_header, print_row
 from paper_figures import (
     CONFIGS,
     PICTURES,
-    ROOT,
     SHAPES,
     Array,
     Log,
@@ -40,25 +39,14 @@ from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import resample
 
-TOP = (
-    "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | "
-    "loss | PSNR shown, novel | found |",
-    "|---|---|---|---|---|---|---|",
+HEADS = (
+    *("config", "iterations", "seconds an iteration", "forward, adjoint iterations of the solves"),
+    *("loss", "PSNR shown, novel", "found"),
 )
-
-
-NAMES_13 = {
-    "default": "default",
-    "one_round": "one round",
-    "half": "half the cells, default",
-    "half_one_round": "half the cells, one round",
-    "half_printed": "half the cells, printed",
-}
-TOP_13 = [
-    "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the "
-    "lowest third | density there, in truth 1 |",
-    "|---|---|---|---|---|---|---|",
-]
+HEADS_13 = (
+    *("model", "iterations", "seconds", "PSNR shown, novel", "L1 error of the density"),
+    *("in the lowest third", "density there, in truth 1"),
+)
 
 
 @dataclass(frozen=True)
@@ -73,8 +61,7 @@ class Run:
 
     def number(self, name: str) -> float | list[float]:
         """The found number, or color, of that name."""
-        found: float | list[float] = json.loads((self.folder / "parameters.json").read_text())[name]
-        return found
+        return json.loads((self.folder / "parameters.json").read_text())[name]
 
     def view(self, name: str, title: str) -> Pair:
         """The view `name`, as the scene has it and as rendered."""
@@ -108,63 +95,34 @@ def relative_l1(ours: Array, truth: Array) -> float:
     return float(np.abs(ours - truth).sum() / truth.sum())
 
 
-def densities(run: Run, truth: Array) -> list[Pair]:
-    """Density seen from the front and from the side, and its middle slice, beside `truth`."""
-    ours = run.field("density")
-    pairs = [
-        Pair(f"density along {name}", project(truth, axis, 1), project(ours, axis, 1))
-        for axis, name in ((0, "z"), (2, "x"))
-    ]
-    middle = truth.shape[0] // 2
-    return [*pairs, Pair("density, middle slice", truth[middle, ::-1], ours[middle, ::-1])]
-
-
 def show_density(truth: str, front: str) -> Shown:
     """What to show of a run that looks for the density of the shape `truth` and was shown the view
-    `front`.
+    `front`: from the front, from the side, and the middle slice.
     """
 
     def shown(runs: Runs) -> tuple[list[Pair], str]:
         run = first(runs)
-        density = shape(truth, run.field("density"))
+        ours = run.field("density")
+        true = shape(truth, ours)
+        slices = (field[len(field) // 2, ::-1] for field in (true, ours))
         pairs = [
             run.view(front, "a view it was shown"),
             run.view("novel", "novel view"),
-            *densities(run, density),
+            Pair("density along z", project(true, 0, 1), project(ours, 0, 1)),
+            Pair("density along x", project(true, 2, 1), project(ours, 2, 1)),
+            Pair("density, middle slice", *slices),
         ]
-        return (
-            pairs,
-            f"relative L1 error of the density {relative_l1(run.field('density'), density):.2f}",
-        )
+        return pairs, f"relative L1 error of the density {relative_l1(ours, true):.2f}"
 
     return shown
-
-
-def draw_rounds(runs: Runs) -> None:
-    """Fig. 13 by other models: a picture of the densities, and a table."""
-    lines, pairs = [*TOP_13], []
-    for name, run in runs.items():
-        density, log = run.field("density"), read_log(run.folder)
-        true, title = shape("bunny", density), f"{NAMES_13[name]}:\ndensity along x"
-        pairs.append(Pair(title, project(true, 2, 1), project(density, 2, 1)))
-        low = slice(0, len(density[0]) // 3)
-        cells = [NAMES_13[name], len(log["loss"]), f"{log['seconds'][-1]:.0f}"]
-        cells += [f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"]
-        cells += [f"{relative_l1(density, true):.3f}"]
-        cells += [f"{relative_l1(density[:, low], true[:, low]):.2f}"]
-        cells += [f"{density[:, low].sum() / true[:, low].sum():.2f}"]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    draw(PICTURES / "fig13_rounds.png", pairs, {})
-    keep("fig13", "python benchmarks/paper.py fig13", lines)
 
 
 def show_light(runs: Runs) -> tuple[list[Pair], str]:
     """The bunny, and the color of its light."""
     run = first(runs)
-    words = (
-        f"irradiance {round_values(run.number('lights.0.irradiance'))}, in truth [3.2, 2.1, 1.2]"
-    )
-    return [run.view("front", "the view it was shown"), run.view("novel", "novel view")], words
+    found = round_values(run.number("lights.0.irradiance"))
+    views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
+    return views, f"irradiance {found}, in truth [3.2, 2.1, 1.2]"
 
 
 def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
@@ -174,10 +132,8 @@ def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
         for name, run in runs.items()
         for view in ("front", "novel")
     ]
-    losses = {name: read_log(run.folder)["loss"] for name, run in runs.items()}
-    return pairs, "last loss " + ", ".join(
-        f"{name} {loss[-1]:.2g}" for name, loss in losses.items()
-    )
+    losses = (f"{name} {read_log(run.folder)['loss'][-1]:.2g}" for name, run in runs.items())
+    return pairs, "last loss " + ", ".join(losses)
 
 
 def show_optics(runs: Runs) -> tuple[list[Pair], str]:
@@ -222,10 +178,8 @@ def compare_optics(
 
 def show_four(runs: Runs) -> tuple[list[Pair], str]:
     """The smoke from all four sides, and from one that nobody knows."""
-    run = first(runs)
-    return [
-        run.view(name, name) for name in ("front", "right", "back", "left", "novel")
-    ], "no true volume"
+    sides = "front", "right", "back", "left", "novel"
+    return [first(runs).view(name, name) for name in sides], "no true volume"
 
 
 def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
@@ -239,17 +193,14 @@ def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
 def middle(field: Array) -> Array:
     """The mean of the four slices of `field` [z, y, x] in the middle across z, y upwards."""
     half = field.shape[0] // 2
-    mean: Array = field[half - 2 : half + 2, ::-1].mean(0)
-    return mean
+    return field[half - 2 : half + 2, ::-1].mean(0)
 
 
 def round_values(values: float | list[float]) -> str:
     """Numbers to three digits."""
-    return (
-        f"{values:.3g}"
-        if isinstance(values, float)
-        else f"[{', '.join(f'{value:.3g}' for value in values)}]"
-    )
+    if isinstance(values, float):
+        return f"{values:.3g}"
+    return f"[{', '.join(f'{value:.3g}' for value in values)}]"
 
 
 @dataclass(frozen=True)
@@ -257,13 +208,12 @@ class Experiment:
     """How a config is run: by `variants`, names of runs with their overrides.
 
     `shown` makes the pairs to draw and says what was found. `others` are variants too, whose logs
-    are not drawn; `draw_more` makes further pictures of them all.
+    are not drawn.
     """
 
     shown: Shown
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"": ()})
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    draw_more: Callable[[Runs], None] = lambda runs: None
 
 
 G_ALONE = (
@@ -275,15 +225,16 @@ G_ALONE = (
 HALF = ("volume.resolution=[32, 48, 32]", "optimize.iterations=120")
 """Fig. 13 in cells twice as large, where the printed scheme, by Jacobi iteration, comes to an end.
 """
-ROUNDS = {
-    "one_round": ("diffusion.transport_rounds=1",),
-    "half": HALF,
-    "half_one_round": (*HALF, "diffusion.transport_rounds=1"),
-    "half_printed": (*HALF, "diffusion.scheme=printed"),
+MODELS_13 = {
+    "default": (),
+    "one round": ("diffusion.transport_rounds=1",),
+    "half the cells, default": HALF,
+    "half the cells, one round": (*HALF, "diffusion.transport_rounds=1"),
+    "half the cells, printed": (*HALF, "diffusion.scheme=printed"),
 }
 PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
 EXPERIMENTS = {
-    "fig13": Experiment(show_density("bunny", "ring_00"), others=ROUNDS, draw_more=draw_rounds),
+    "fig13": Experiment(show_density("bunny", "ring_00")),
     "fig06_light": Experiment(show_light),
     "fig06_density": Experiment(show_density("knot", "front")),
     "fig10": Experiment(show_optics, others={"g_alone": G_ALONE}),
@@ -296,8 +247,8 @@ EXPERIMENTS = {
 """By their configs, in the order of docs/experiments.md."""
 
 
-def row(name: str, log: Log, words: str) -> str:
-    """A line of the table: what the first variant took and found."""
+def print_found(name: str, log: Log, words: str) -> None:
+    """Prints a row of the table: what the first variant took and found."""
     tenth = max(len(log["loss"]) // 10, 1)
     seconds, ends = pace(log), (slice(tenth), slice(-tenth, None))
     times = " to ".join(f"{np.median(seconds[end]):.2g}" for end in ends)
@@ -310,47 +261,68 @@ def row(name: str, log: Log, words: str) -> str:
         "-" if np.isnan(log[column][-1]) else f"{log[column][-1]:.1f} dB"
         for column in ("psnr", "test_psnr")
     )
-    return f"| {name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | {words} |"
+    print_row(name, len(seconds), times, solves, losses, quality, words)
 
 
-def remake(name: str, output: Path, is_kept: bool) -> str:
-    """Runs the experiment `name` unless `is_kept` and done, draws it, and returns its row."""
-    experiment, runs = EXPERIMENTS[name], dict[str, Run]()
-    for variant, overrides in {**experiment.variants, **experiment.others}.items():
-        folder = output / (f"{name}_{variant}" if variant else name)
+def make_runs(
+    config: str, variants: Mapping[str, tuple[str, ...]], output: Path, is_kept: bool
+) -> Runs:
+    """Runs of a config with overrides, by their names, those left out that are kept and done."""
+    runs = {}
+    for variant, overrides in variants.items():
+        folder = output / f"{config}_{variant}".strip("_").replace(" ", "_").replace(",", "")
         if not (is_kept and (folder / "summary.json").exists()):
             options = as_options(overrides)
-            ddrecon("optimize", CONFIGS / f"{name}.yaml", "-o", folder, *options)
+            ddrecon("optimize", CONFIGS / f"{config}.yaml", "-o", folder, *options)
             ddrecon("render", folder, "-o", folder / "views")
-        runs[variant or "default"] = Run(folder)
+        runs[variant] = Run(folder)
+    return runs
+
+
+def remake(name: str, output: Path, is_kept: bool) -> None:
+    """Runs the experiment `name`, draws it, and prints its row."""
+    experiment = EXPERIMENTS[name]
+    runs = make_runs(name, {**experiment.variants, **experiment.others}, output, is_kept)
     pairs, words = experiment.shown(runs)
-    logs = {key: read_log(run.folder) for key, run in runs.items() if key not in experiment.others}
+    logs = {key: read_log(runs[key].folder) for key in experiment.variants}
     draw(PICTURES / f"{name}.png", pairs, logs)
-    experiment.draw_more(runs)
-    return row(name, read_log(first(runs).folder), words)
+    print_found(name, read_log(first(runs).folder), words)
+
+
+def compare_models(output: Path, is_kept: bool) -> None:
+    """Fig. 13 by several models: a picture of the densities, and a table."""
+    print_header(*HEADS_13)
+    pairs = []
+    for name, run in make_runs("fig13", MODELS_13, output, is_kept).items():
+        density, log = run.field("density"), read_log(run.folder)
+        true = shape("bunny", density)
+        pairs.append(Pair(f"{name}:\ndensity along x", project(true, 2, 1), project(density, 2, 1)))
+        low = slice(0, len(density[0]) // 3)
+        print_row(
+            *(name, len(log["loss"]), f"{log['seconds'][-1]:.0f}"),
+            f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB",
+            relative_l1(density, true),
+            f"{relative_l1(density[:, low], true[:, low]):.2f}",
+            f"{density[:, low].sum() / true[:, low].sum():.2f}",
+        )
+    draw(PICTURES / "fig13_rounds.png", pairs, {})
 
 
 def main() -> None:
-    """Runs, draws and tabulates the named experiments, or all."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="of a config in configs/paper; all unless given"
-    )
+    """Runs, draws and tabulates what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("name", nargs="?", choices=[*EXPERIMENTS, "fig08"], metavar="NAME")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper")
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()
-    names = given.names or [config.stem for config in CONFIGS.glob("*.yaml")]
-    rows = {line.split(" | ")[0][2:]: line for line in read_store()["paper"]["table"][2:]}
-    for name in EXPERIMENTS:
-        if name in names:
-            rows[name] = remake(name, given.output / "small", given.keep)
-            print(rows[name], flush=True)
-    lines = [*TOP, *(rows[name] for name in EXPERIMENTS if name in rows)]
-    keep("paper", "python benchmarks/paper.py", lines)
-    if "fig08" in names and find_spec("mitsuba"):
-        paper_gradients.remake(given.output / "fig08")
+    if given.name == "fig08":
+        paper_gradients.remake(given.output)
+    elif given.name == "fig13":
+        compare_models(given.output, given.keep)
+    else:
+        print_header(*HEADS)
+        for name in [given.name] if given.name else EXPERIMENTS:
+            remake(name, given.output, given.keep)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from figures import ROOT
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -25,7 +26,6 @@ import matplotlib.pyplot as plt
 
 Array = NDArray[np.float32]
 Log = Mapping[str, NDArray[np.float64]]
-ROOT = Path(__file__).parents[1]
 CONFIGS, SHAPES, PICTURES = (
     ROOT / place for place in ("configs/paper", "data/shapes", "docs/pictures/paper")
 )

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from figures import as_options, ddrecon, keep
+from figures import as_options, ddrecon, print_header, print_row
 from numpy.typing import NDArray
 from paper_figures import (
     CONFIGS,
@@ -44,7 +44,6 @@ MODELS = {
     "2 rounds": ("diffusion.transport_rounds=2",),
 }
 """The paper's own scheme, and ours without and with transport rounds, as overrides."""
-TOP = "| by | what | noise | error | in the regions | correlation |", "|---|---|---|---|---|---|"
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,11 @@ def relative_error(image: Array, truth: Array) -> float:
 
 
 def remake(folder: Path) -> None:
-    """Draws the picture and rewrites the table."""
+    """Draws the picture and prints the table."""
+    folder = folder / "fig08"
     folder.mkdir(parents=True, exist_ok=True)
-    seen, lines, count = regions(folder), [*TOP], len(MODELS)
+    seen, count = regions(folder), len(MODELS)
+    print_header("by", "what", "noise", "error", "in the regions", "correlation")
     figure, axes = plt.subplots(2, 1 + 2 * count, figsize=(12, 4), layout="constrained")
     for row, change in zip(axes, changes(folder), strict=True):
         truth, noise = trace_derivative(change, folder)
@@ -135,28 +136,26 @@ def remake(folder: Path) -> None:
         show_signed(row[0], truth, full, "differences of\npath tracing")
         for column, name in enumerate(MODELS, 1):
             image = differentiate(change, folder, name)
-            lines.append(line(change, name, image, truth, noise, seen))
+            print_error(change, name, image, truth, noise, seen)
             show_signed(row[column], image, full, f"ours, {name}")
             away = row[column + count]
             show(away, np.abs(image - truth), full / ENLARGED, "inferno")
             words = f"{ENLARGED} x |error|,\nours, {name}: {relative_error(image, truth):.2f}"
             away.set_title(words, fontsize=8)
     save(figure, PICTURE)
-    keep("fig08", "python benchmarks/paper.py fig08", lines)
 
 
-def line(
+def print_error(
     change: Change,
     name: str,
     image: Array,
     truth: Array,
     noise: float,
     seen: dict[str, NDArray[np.bool_]],
-) -> str:
-    """A line of the table: errors of `image`, and the `noise` there is in truth, or in it."""
+) -> None:
+    """Prints a row: errors of `image`, and the `noise` there is in truth, or in it."""
     errors = ((region, relative_error(image[at], truth[at])) for region, at in seen.items())
     words = ", ".join(f"{region} {error:.3f}" for region, error in errors)
-    alike = np.corrcoef(image.ravel(), truth.ravel())[0, 1]
-    numbers = noise / np.sqrt((truth**2).mean()), relative_error(image, truth)
-    cells = [change.parameter, name, *(f"{n:.3f}" for n in numbers), words, f"{alike:.3f}"]
-    return f"| {' | '.join(cells)} |"
+    alike = float(np.corrcoef(image.ravel(), truth.ravel())[0, 1])
+    share = noise / float(np.sqrt((truth**2).mean()))
+    print_row(change.parameter, name, share, relative_error(image, truth), words, alike)

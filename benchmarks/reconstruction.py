@@ -1,28 +1,27 @@
-"""What reconstructions come to: held-out PSNR, errors of the density, seconds; of the capture also
-exposures, lamp and cameras; of the first frames of the film how the last of them is alone as well.
+"""What reconstructions come to: of the plume by settings; of the capture also exposures, lamp and
+cameras; of the first frames of the film how the last of them is alone as well.
 
-    python benchmarks/reconstruction.py plume|gallery|capture|film [-o FOLDER]
+    python benchmarks/reconstruction.py plume|capture|film [-o FOLDER]
 
-Every run is a process of its own, `ddrecon optimize`, after one that compiled its kernels. Tables
-are Markdown. Runs are left in FOLDER.
+Every run is a process of its own, `ddrecon optimize`. Tables are Markdown. Runs are left in FOLDER.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import Used, as_options, ddrecon, print_header, print_row
+from figures import ROOT, Used, as_options, ddrecon, print_header, print_row
+from inverse import CONFIGS, measure, print_measured
+from inverse_scenes import coarsened
 
 from ddrecon.io.volumes.table import read_field
 
-ROOT = Path(__file__).parents[1]
 CAPTURE, FILM = ROOT / "data/capture", ROOT / "data/film"
 LAMP, SUN = (7.3, 7.0, 6.4), (0.8, -0.45, -0.4)
 """Irradiance and direction of the light by which pictures of the capture and film were made."""
@@ -37,60 +36,20 @@ PLUME = {
     "loss: photon": ("-D", "optimize.loss=photon"),
     "engine torch": ("--engine", "torch"),
 }
-GALLERY = {
-    "plume": "plume/density",
-    "cumulus_field": "cumulus_field/density",
-    "smoke_sky": "",
-    "satellite": "cumulus_field/density",
-    "fire": "fire/fire",
-    "phantom": "",
-    "photograph": "",
-}
-"""Configs, and the file of data that holds the true density, if any does."""
-
-
-def optimize(
-    config: str, folder: Path, options: Sequence[str] = ()
-) -> tuple[dict[str, Any], float]:
-    """The summary of a run in `folder`, and the seconds of its process."""
-    seconds = ddrecon("optimize", ROOT / f"configs/{config}.yaml", "-o", folder, *options).seconds
-    return json.loads((folder / "summary.json").read_text()), seconds
 
 
 def read_density(path: Path) -> np.ndarray:
     return read_field(path, "density").values.astype(np.float64)
 
 
-def coarsened(density: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Means of `density` over the cells of a grid of `shape`."""
-    for axis, (count, own) in enumerate(zip(shape, density.shape, strict=True)):
-        parts = np.repeat(density, math.lcm(count, own) // own, axis)
-        parts = parts.reshape(*parts.shape[:axis], count, -1, *parts.shape[axis + 1 :])
-        density = parts.mean(axis + 1)
-    return density
-
-
-def density_errors(run: Path, truth: Path) -> tuple[float, float, float]:
-    """Relative L1 and L2 errors of the density of `run`, and its correlation with the truth."""
-    found = read_density(run / "volumes" / "density.npz")
-    true = coarsened(read_density(truth), found.shape)
-    away = found - true
-    return (
-        float(np.abs(away).sum() / np.abs(true).sum()),
-        float(np.linalg.norm(away) / np.linalg.norm(true)),
-        float(np.corrcoef(found.flat, true.flat)[0, 1]),
-    )
-
-
-def print_runs(runs: dict[str, tuple[str, str, Sequence[str]]], folder: Path) -> None:
-    """Prints a row for each run: by its name the config, where its truth is, and options."""
-    print_header("run", "held out", "L1", "L2", "correlation", "seconds")
-    for name, (config, truth, options) in runs.items():
+def print_plume(folder: Path) -> None:
+    """A row for each of the settings of `PLUME`, after a run that compiles kernels."""
+    columns = "held out", "L1", "L2", "seconds"
+    measure(CONFIGS["plume"], folder / "first", ("--iterations", "6"))
+    print_header("run", *columns)
+    for name, options in PLUME.items():
         place = folder / name.replace(" ", "_").replace(":", "")
-        summary, seconds = optimize(config, place, options)
-        psnr = summary.get("test_psnr")
-        errors = density_errors(place, ROOT / "data" / f"{truth}.npz") if truth else ("",) * 3
-        print_row(name, f"{psnr:.1f} dB" if psnr else "", *errors, f"{seconds:.0f}")
+        print_measured(name, measure(CONFIGS["plume"], place, options), columns)
 
 
 def rotation_between(found: np.ndarray, true: np.ndarray) -> float:
@@ -117,8 +76,7 @@ def pixels_off(
 
 def print_capture(folder: Path) -> None:
     """Runs the capture, and prints what it found beside what its cameras were told."""
-    summary, seconds = optimize("capture", folder)
-    error = density_errors(folder, CAPTURE / "density.npz")[0]
+    row = measure(CONFIGS["capture"], folder)
     values = json.loads((folder / "parameters.json").read_text())
     told, truth = (
         json.loads((CAPTURE / name).read_text())["frames"]
@@ -135,10 +93,9 @@ def print_capture(folder: Path) -> None:
         shifts.append([pixels_off(pose, true, frame["fl_x"]) for pose in both])
     lamp = 100 * (np.divide(values["lights.0.irradiance"], LAMP) - 1)
     span = "{:.2f} to {:.2f}".format
-    print_row("what", "given", "found")
-    print_row("---", "---", "---")
-    print_row("held-out picture, as displayed", "", f"{summary['test_psnr']:.1f} dB")
-    print_row("density, relative L1 error", "", error)
+    print_header("what", "given", "found")
+    print_row("held-out picture, as displayed", "", f"{row['held out'][0]:.1f} dB")
+    print_row("density, relative L1 error", "", *row["L1"])
     print_row("exposures, mean error", "", f"{np.mean(gains):.1f} %")
     print_row("exposures, worst error", "", f"{np.max(gains):.1f} %")
     print_row("lamp, error by color", "", ", ".join(f"{part:+.0f} %" for part in lamp))
@@ -147,7 +104,7 @@ def print_capture(folder: Path) -> None:
         ("turn [degrees]", turns),
     ):
         print_row(what, *(span(min(part), max(part)) for part in zip(*pairs, strict=True)))
-    print_row("seconds of the process", "", f"{seconds:.0f}")
+    print_row("seconds of the process", "", f"{row['seconds'][0]:.0f}")
 
 
 def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], Used]:
@@ -209,21 +166,13 @@ def print_film(folder: Path) -> None:
 
 def main() -> None:
     """Runs what the command line asks for."""
+    prints = {"plume": print_plume, "capture": print_capture, "film": print_film}
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("plume", "gallery", "capture", "film"))
+    parser.add_argument("what", choices=prints)
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
     folder = given.output or Path(tempfile.mkdtemp())
-    if given.what == "capture":
-        print_capture(folder / "capture")
-    elif given.what == "film":
-        print_film(folder)
-    elif given.what == "plume":
-        optimize("plume", folder / "first", ("--iterations", "6"))
-        runs = {name: ("plume", "plume/density", options) for name, options in PLUME.items()}
-        print_runs(runs, folder)
-    else:
-        print_runs({name: (name, truth, ()) for name, truth in GALLERY.items()}, folder)
+    prints[given.what](folder.resolve() / given.what)
 
 
 if __name__ == "__main__":

@@ -76,8 +76,8 @@ def numbers_in_cell(
 ) -> float:
     """How many numbers are alive in each cell of light at the peak, of which so many are `varied`.
 
-    `is_directed`: whether light scatters unevenly. The coefficients are fitted to what
-    `benchmarks/memory.py --count` finds alive.
+    `is_directed`: whether light scatters unevenly. The coefficients were fitted to
+    counts; `benchmarks/memory.py` compares what follows with the memory of processes.
     """
     moments = count_harmonics(settings.angles) if is_directed else 1
     rendered = 18 + 1.5 * moments

@@ -13,8 +13,6 @@ from tape import record
 
 from ddrecon.engine import use_engine
 from ddrecon.reconstruct.gradients import Replays
-from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.setup import scene_at_level
 
 MOST_READS, MOST_WRITES = 20, 4
 MOST_LAUNCHES = {"no round": 660, "a round": 950, "plume.yaml": 1_260}
@@ -42,20 +40,20 @@ def test_an_iteration_launches_and_waits_seldom(launches, case):
     use_engine("warp")
     with as_on_a_gpu():
         if case == "plume.yaml":
-            run = Reconstruction(scene_at_level(launches.load(3, 1, "cpu"), 4))
+            run = launches.start_plume(factor=4)
         else:
-            run = launches.begin_plume(16, 128, int(case == "a round"), "cpu")
+            run = launches.start_paper_case(16, 128, int(case == "a round"))
         counts = launches.count(run)
-    assert counts.total("call", "launch") <= MOST_LAUNCHES[case], counts.of
-    assert counts.total("read") <= MOST_READS, counts.of
-    assert counts.total("write") <= MOST_WRITES, counts.of
+    assert counts["call"] + counts["launch"] <= MOST_LAUNCHES[case], counts
+    assert counts["read"] <= MOST_READS, counts
+    assert counts["write"] <= MOST_WRITES, counts
 
 
 @pytest.mark.slow
 def test_a_recorded_iteration_reads_twice(launches):
     """Losses with residuals, and the slope with what else the search decides by."""
     use_engine("warp")
-    run = launches.begin_plume(12, 48, 1, "cpu")
+    run = launches.start_paper_case(12, 48, 1)
     (frame,) = run.frames
     # A GPU takes all pixels' rays.
     scene = frame.replays.scene
@@ -63,4 +61,4 @@ def test_a_recorded_iteration_reads_twice(launches):
     frame.replays = replays
     counts = launches.count(run)
     assert replays.recording is not None
-    assert counts.total("read") == 2 and counts.total("write") <= 2, counts.of
+    assert counts["read"] == 2 and counts["write"] <= 2, counts
