@@ -37,27 +37,22 @@ No scene needs them: they choose between ways to compute the same, for compariso
 INTRODUCTION = """\
 Every key, with what it takes, its limits and its default, made from the program's own schema.
 
-- Vectors are x, y, z.
-- Lengths are in a world unit u of your choice.
-- `1e-3` is a number.
+- Vectors are x, y, z, and lengths in a world unit u of your choice; `1e-3` is a number.
 - Paths are relative to the scene file; those of `-D` and `--light` to the current folder.
 - Three equal colors are rendered as one, unless they are optimized.
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
-[Keys for experts](#keys-for-experts) stand at the end.
 Small scenes with other phase functions, models and losses are in `configs/kinds`.
-
-Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json).
-Its place is the file's first line: `# yaml-language-server: $schema=PATH/scene.schema.json`."""
+Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json), which \
+the file's first line names: `# yaml-language-server: $schema=PATH/scene.schema.json`."""
 PARAMETERS = """\
 ## Names of parameters
 
-What can be found.
-N is the place of a light in its list, counted from 0.
-NAME is a view's name, or `*` for all training views.
+What can be found: N is the place of a light in its list, counted from 0, and NAME a view's name, \
+or `*` for all training views.
 Where there are two media, `media.cloud.density` is as `density` is, and so on.
-Colors have entries `.r`, `.g`, `.b`; places and directions have `.x`, `.y`, `.z`.
-A lens has its coefficients, `.k1` and so on.
+Colors have entries `.r`, `.g`, `.b`, places and directions `.x`, `.y`, `.z`, a lens `.k1` and \
+so on.
 A `camera` has `.rotation_x` ... and `.x` ...: a rotation about the middle of the box [radians], \
 then a shift [u], both in its axes (right, up, backward).
 A `focal` length is in widths of the image.
