@@ -346,10 +346,8 @@ def print_thick(place: Path) -> None:
         path = Case(lit, field, sigma_t, 0.95, g, (sun(travel),), camera).write(place, THICK_CELLS)
         views = "views.0.camera.resolution=[16, 16]"
         truth = render(refine(load_scene(path, overrides=(views, *by_dial(5, 5)))))
-        images = (
-            render(load_scene(path, overrides=(views, *model))) for model in THICK_MODELS.values()
-        )
-        errors = (float((image - truth).norm() / truth.norm()) for image in images)
+        scenes = (load_scene(path, overrides=(views, *model)) for model in THICK_MODELS.values())
+        errors = (float((render(scene) - truth).norm() / truth.norm()) for scene in scenes)
         print_row(str(g), f"{depth:g}", lit, *(f"{error:.3f}" for error in errors))
 
 
@@ -361,12 +359,12 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         references, place = given.references, Path(name)
-        if given.what == "eleven":
-            print_errors(known_cases(references, place))
-        elif given.what == "derivative":
+        if given.what == "derivative":
             print_derivatives(references, place)
         elif given.what == "thick":
             print_thick(place)
+        elif given.what == "eleven":
+            print_errors(known_cases(references, place))
         else:
             print_errors(own_cases(CASES[given.what], references, place))
 

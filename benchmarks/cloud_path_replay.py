@@ -1,15 +1,14 @@
 """The cloud of a feature film from 64 path-traced pictures: `ddrecon optimize` by its defaults, and
 path replay backpropagation in Mitsuba 3 in the same time of one processor.
 
-    DRJIT_LIBLLVM_PATH=... python benchmarks/cloud_path_replay.py wdas_cloud_sixteenth.vdb
-                                                                  [-o FOLDER] [--times 1]
+    DRJIT_LIBLLVM_PATH=... python benchmarks/cloud_path_replay.py wdas_cloud_sixteenth.vdb -o FOLDER
 
 80 cameras stand on a sphere, every fifth held out, as in vol_rec_from_images (Leonard and
 Westermann 2024). Pictures are Mitsuba's, of the cells that are sought, so that path replay can find
 the very volume; the cloud is thinner and scatters less forward than configs/cloud.yaml has it,
 where pictures by paths are too noisy. Path replay steps by Adam, a view after another, on grids a
 quarter and half as fine at first; each of `RATES` has the processor seconds that our whole run
-took, `--times` over. Both know that density is not negative.
+took. Both know that density is not negative.
 
 What was found is judged by path tracing from the held-out cameras: the mean of products of two
 errors, each of a trace and of a picture of its own, is the squared error without their noise. L1 is
@@ -30,7 +29,7 @@ import numpy as np
 import torch
 import yaml
 from figures import ROOT, ddrecon, print_header, print_row
-from inverse_scenes import coarsened
+from inverse_scenes import coarsened, look
 from path_replay import Replay, why_not
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -64,14 +63,11 @@ def write_scene(cloud: Path, folder: Path) -> Path:
     for index in range(VIEWS):
         height = 1 - (2 * index + 1) / VIEWS
         angle, radius = index * math.pi * (3 - math.sqrt(5)), math.sqrt(1 - height**2)
-        away = np.array([radius * math.sin(angle), height, radius * math.cos(angle)])
-        middle = (low + high) / 2
-        origin = middle + 2 * np.linalg.norm(high - low) * away
-        camera = {"type": "perspective", "origin": origin.tolist(), "target": middle.tolist()}
-        camera |= {"fov": 22, "resolution": [PIXELS, PIXELS]}
-        split = "test" if index % TEST_EVERY == 0 else "train"
-        name = f"{split}_{index:02d}"
-        views.append({"name": name, "camera": camera, "split": split, "image": f"{name}.npy"})
+        way = np.array([radius * math.sin(angle), height, radius * math.cos(angle)])
+        away, camera = 2 * np.linalg.norm(high - low) * way, {"resolution": [PIXELS] * 2}
+        name = f"{'train' if index % TEST_EVERY else 'test'}_{index:02d}"
+        views.append(look(name, (low + high) / 2, away, fov=22, **camera))
+        views[-1]["image"] = f"{name}.npy"
     medium = {"sigma_t": SIGMA_T, "albedo": 1, "g": G}
     bounds = {"min": low.tolist(), "max": high.tolist()}
     scene = {
@@ -171,12 +167,9 @@ def held_out(scene: Scene, density: np.ndarray, folder: Path) -> float:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cloud", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "cloud_path_replay")
-    parser.add_argument("--times", type=float, default=1.0)
     given = parser.parse_args()
     if lacking := why_not():
         raise SystemExit(f"path replay {lacking}")
@@ -198,9 +191,8 @@ def main() -> None:
     density, seconds = by_us(path, folder)
     judge("ours", density, len((folder / "ours/loss.csv").read_text().splitlines()) - 1, seconds)
     for rate in RATES:
-        density, iterations = by_path_replay(scene, rate, given.times * seconds)
-        np.save(folder / f"path_replay_{rate:g}.npy", density)
-        judge(f"path replay, rate {rate:g}", density, iterations, given.times * seconds)
+        density, iterations = by_path_replay(scene, rate, seconds)
+        judge(f"path replay, rate {rate:g}", density, iterations, seconds)
 
 
 if __name__ == "__main__":

@@ -88,21 +88,20 @@ class Used(NamedTuple):
     memory: float
 
 
-def run(command: Sequence[str | Path], folder: Path | None = None) -> Used:
-    """What `command` takes, run in `folder`; raises SystemExit where it fails."""
+def ddrecon(*arguments: str | Path, folder: Path | None = None) -> Used:
+    """What a command of ours takes, run in `folder`, over what it left there.
+
+    Raises SystemExit where it fails.
+    """
+    command = [sys.executable, "-m", "ddrecon", *arguments, "-q", "--overwrite"]
     start = time.perf_counter()
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - start
     if status:
         words = " ".join(map(str, command))
         raise SystemExit(f"{words}: exit {os.waitstatus_to_exitcode(status)}")
+    seconds = time.perf_counter() - start
     return Used(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
-
-
-def ddrecon(*arguments: str | Path, folder: Path | None = None) -> Used:
-    """What a command of ours takes, run in `folder`, over what it left there."""
-    return run([sys.executable, "-m", "ddrecon", *arguments, "-q", "--overwrite"], folder)
 
 
 def as_options(overrides: Sequence[str]) -> list[str]:
@@ -124,11 +123,8 @@ def print_header(*names: str) -> None:
 
 def pages() -> list[Path]:
     """Where figures may stand."""
-    return [
-        ROOT / "README.md",
-        *sorted((ROOT / "docs").glob("*.md")),
-        ROOT / "benchmarks/tables.md",
-    ]
+    docs = sorted((ROOT / "docs").glob("*.md"))
+    return [ROOT / "README.md", *docs, ROOT / "benchmarks/tables.md"]
 
 
 def read_figures() -> dict[str, str]:
@@ -162,13 +158,12 @@ def describe_machine() -> str:
 
 def write(name: str, text: str) -> None:
     """Puts the `text` of a figure where it stands."""
+
+    def fill(place: re.Match[str]) -> str:
+        return place[1] + text + place[4] if place[2] == name else place[0]
+
     for page in pages():
-        old = page.read_text()
-        new = PLACE.sub(
-            lambda place: place[1] + text + place[4] if place[2] == name else place[0], old
-        )
-        if new != old:
-            page.write_text(new)
+        page.write_text(PLACE.sub(fill, page.read_text()))
 
 
 def show_summary(figures: dict[str, str]) -> str:

@@ -69,13 +69,17 @@ class Check:
             torch.cuda.synchronize()
         return time.perf_counter()
 
-    def time_of(self, action: Callable[[], Any], count: int) -> float:
-        """Seconds of one `action`, of so many after a first."""
-        action()
+    def time_of(self, action: Callable[[], Any], count: int = 1) -> float:
+        """Seconds of one `action`, of so many in a row."""
         start = self.now()
         for _ in range(count):
             action()
         return (self.now() - start) / count
+
+    def begin(self, name: str) -> Reconstruction:
+        """One of `runs`, as it begins each time."""
+        torch.manual_seed(0)
+        return self.runs()[name]()
 
     def runs(self) -> dict[str, Callable[[], Reconstruction]]:
         """Reconstructions by name, the largest shrunk twice; the paper's are of an RTX 2080 Ti."""
@@ -121,6 +125,7 @@ def machine(check: Check) -> Iterator[str]:
         )
     big = torch.empty(2**27 // check.shrink**2, device=check.device)
     other, tiny = torch.empty_like(big), torch.zeros(16, device=check.device)
+    other.copy_(big)
     seconds = check.time_of(lambda: other.copy_(big), 10)
     yield f"copy: {2 * big.nbytes / seconds / 1e12:.2f} TB/s"
     varied = tiny.clone().requires_grad_()
@@ -138,15 +143,14 @@ def machine(check: Check) -> Iterator[str]:
         actions["a launch, bound"] = lambda: bound.launch(16)
         actions["a launch, bound anew"] = lambda: kernel.launch(16, {"x": tiny}, {"out": tiny})
     for name, action in actions.items():
+        action()
         yield f"{name}: {1e6 * check.time_of(action, 2000):.1f} us"
 
 
 def kernels(check: Check) -> Iterator[str]:
     """The first iteration of some runs, with all kernels compiled."""
     for name in ("64 x 96 x 64, 512^2, a round", "plume.yaml, 16 x 24 x 16"):
-        run, start = check.runs()[name](), check.now()
-        run.step()
-        yield f"{name}: first iteration {check.now() - start:.1f} s"
+        yield f"{name}: first iteration {check.time_of(check.begin(name).step):.1f} s"
 
 
 def results(path: Path, device: torch.device, cells: float) -> dict[str, Tensor]:
@@ -194,17 +198,18 @@ def agree(check: Check) -> Iterator[str]:
             continue
         for engine in engines:
             use_engine(engine)
-            errors = {
-                name: float(
-                    (value.cpu() - known[name]).norm() / known[name].norm().clamp(min=1e-300)
-                )
-                for name, value in results(path, check.device, cells).items()
-            }
+            found = results(path, check.device, cells)
+            errors = {name: apart(value, known[name]) for name, value in found.items()}
             far = max(errors, key=lambda name: errors[name])
             farthest.extend(errors.values())
             yield f"| {path.stem} | {engine} | {errors['light']:.0e} | {errors[far]:.0e} | {far} |"
     use_engine(check.engine)
     assert all(error <= AGREEMENT for error in farthest), f"farther than {AGREEMENT}"
+
+
+def apart(one: Tensor, other: Tensor) -> float:
+    """How far two tensors are apart, relative to the second."""
+    return float((one.cpu() - other.cpu()).norm() / other.norm().clamp(min=1e-300))
 
 
 def speed(check: Check) -> Iterator[str]:
@@ -223,9 +228,7 @@ def measure(check: Check, run: Reconstruction) -> str:
         torch.cuda.reset_peak_memory_stats()
     taken = list[float]()
     while len(taken) < 3 or (len(taken) < 14 // check.shrink and sum(taken) < SECONDS):
-        start = check.now()
-        run.step()
-        taken.append(check.now() - start)
+        taken.append(check.time_of(run.step))
     seconds, seen = median(taken[2:]), ["-"] * 6
     if check.is_gpu:
         with profile(activities=[ProfilerActivity.CUDA]) as recorded:
@@ -252,18 +255,15 @@ def graphs(check: Check) -> Iterator[str]:
     for name in ("64 x 96 x 64, 512^2, no round (the paper: 22.5/s)", "plume.yaml, 16 x 24 x 16"):
         ends, seconds = [], []
         for is_plain in (True, False):
-            torch.manual_seed(0)
-            run = check.runs()[name]()
+            run = check.begin(name)
             if is_plain:
                 run.frames[0].replays.new_recorder = None
-            taken = [check.time_of(run.step, 1) for _ in range(6)]
+            seconds.append(median([check.time_of(run.step) for _ in range(12)][4:]))
             ends.append(run.parameters[0].value.detach())
-            seconds.append(median(taken[1:]))
         is_recorded = run.frames[0].replays.recording is not None
-        apart = float((ends[0] - ends[1]).norm() / ends[0].norm())
         yield (
             f"{name}: {seconds[0]:.4f} s plainly, {seconds[1]:.4f} s replayed "
-            f"(recorded: {is_recorded}), apart {apart:.1e}"
+            f"(recorded: {is_recorded}), apart {apart(*ends):.1e}"
         )
         assert is_recorded == check.is_gpu
 
@@ -287,12 +287,11 @@ def bits(check: Check) -> Iterator[str]:
     for name in ("64 x 96 x 64, 512^2, a round", "plume.yaml, 32 x 48 x 32"):
         ends = []
         for _ in range(2):
-            torch.manual_seed(0)
-            run = check.runs()[name]()
+            run = check.begin(name)
             for _ in range(3):
                 run.step()
             ends.append(run.parameters[0].value.detach())
-        yield f"{name}: {float((ends[0] - ends[1]).norm() / ends[0].norm()):.1e}"
+        yield f"{name}: {apart(*ends):.1e}"
         assert torch.equal(*ends)
 
 

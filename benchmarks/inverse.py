@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 from figures import ROOT, as_options, ddrecon, print_header, print_row
-from inverse_scenes import BUILDERS, coarsened, perspective
+from inverse_scenes import BUILDERS, coarsened, look
 
 from ddrecon.io.volumes.table import read_field
 
@@ -94,9 +94,9 @@ def write_views(source: Path, folder: Path) -> None:
     views = []
     for view in about["views"]:
         place, image = view["camera"], str(source / f"{view['name']}.npy")
-        look = {key: place[key] for key in ("up", "fov")} | {"resolution": view["resolution"]}
+        camera = {key: place[key] for key in ("up", "fov")} | {"resolution": view["resolution"]}
         away = np.subtract(place["origin"], place["target"])
-        views.append(perspective(view["name"], place["target"], away, **look) | {"image": image})
+        views.append(look(view["name"], place["target"], away, **camera) | {"image": image})
     medium = {key: about[key] for key in ("sigma_t", "albedo", "g")}
     box = {"bounds": {"min": (-sides).tolist(), "max": sides.tolist()}}
     lights = [{"type": "directional", **light} for light in about["light"]]

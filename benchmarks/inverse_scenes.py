@@ -59,8 +59,11 @@ class Case:
         known = {name: {"file": "fine.npz"} for name in self.fields}
         scene = {"volume": self.volume | known, "lights": self.lights, "views": self.views}
         (folder / "fine.yaml").write_text(json.dumps(scene | EXACT))  # JSON is YAML
+        # In a process of its own: what this one takes would count as memory of its runs.
+        ddrecon("render", "fine.yaml", "-o", "images", folder=folder)
         chance = np.random.default_rng(1)
-        for view, picture in zip(self.views, render_views(folder / "fine.yaml"), strict=True):
+        for view in self.views:
+            picture = np.load(folder / "images" / f"{view['name']}.npy")
             noise = np.hypot(NOISE * picture, LEAST_NOISE * picture.max())
             # Gray pictures have one noise in all colors.
             picture = picture + noise * chance.normal(size=(*picture.shape[:2], 1))
@@ -80,16 +83,6 @@ def coarsened(density: Array, shape: Sequence[int]) -> Array:
         parts = parts.reshape(*parts.shape[:axis], count, -1, *parts.shape[axis + 1 :])
         density = parts.mean(axis + 1)
     return density
-
-
-def render_views(scene: Path) -> list[Array]:
-    """The pictures [h, w, 3] of all views of the JSON `scene`.
-
-    They are those of a process of its own: what this one takes would count as memory of its runs.
-    """
-    ddrecon("render", scene.name, "-o", "images", folder=scene.parent)
-    names = [view["name"] for view in json.loads(scene.read_text())["views"]]
-    return [np.load(scene.parent / "images" / f"{name}.npy") for name in names]
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
@@ -135,23 +128,21 @@ def dome(points: Array, x: float, y: float, base: float, radius: float, height: 
     return 1 - (distance**2).sum(-1)
 
 
-def perspective(name: str, middle: Sequence[float], away: Sequence[float], **camera: Any) -> View:
-    """A view of `middle` from the point `away` from it."""
-    origin = [a + b for a, b in zip(middle, away, strict=True)]
-    camera |= {"type": "perspective", "origin": origin, "target": list(middle)}
+def look(name: str, middle: Sequence[float], away: Sequence[float], **camera: Any) -> View:
+    """A view of `middle` from the point `away` from it, in perspective unless it says else."""
+    camera = {"type": "perspective"} | camera | {"target": list(middle)}
+    camera["origin"] = np.add(middle, away).tolist()
     return {"name": name, "split": name.split("_")[0], "camera": camera}
 
 
 def along_track(middle: Sequence[float], width: float, pixels: int) -> list[View]:
     """Nine views along y, and a tenth across them that is held out, by parallel rays."""
+    camera = {"type": "orthographic", "up": [0, 1, 0], "width": width, "resolution": [pixels] * 2}
     ways = [(f"train_{number}", 0.0, angle) for number, angle in enumerate(ANGLES)]
     views = []
     for name, x, y in [*ways, ("test_across", 50.0, 20.0)]:
         way = np.array([math.tan(math.radians(x)), math.tan(math.radians(y)), 1])
-        origin = middle + 5 * way / np.linalg.norm(way)
-        camera = {"type": "orthographic", "origin": origin.tolist(), "target": list(middle)}
-        camera |= {"up": [0, 1, 0], "width": width, "resolution": [pixels, pixels]}
-        views.append({"name": name, "split": name.split("_")[0], "camera": camera})
+        views.append(look(name, middle, 5 * way / np.linalg.norm(way), **camera))
     return views
 
 
@@ -176,8 +167,8 @@ def cumuli() -> Case:
     above = [(-0.5, 0, 1.35), (-0.25, 0.1, 1.4), (0, -0.1, 1.45), (0.25, 0.1, 1.4), (0.5, 0, 1.35)]
     eyes = [(f"train_{number}", eye, [0, 1, 0]) for number, eye in enumerate(above)]
     eyes += [("test_0", (0.1, 0.5, 1.3), [0, 1, 0]), ("test_1", (1.5, 0.4, 0.6), [0, 0, 1])]
-    look = {"fov": 36, "resolution": [40] * 2}
-    views = [perspective(name, middle, eye, up=up, **look) for name, eye, up in eyes]
+    camera = {"fov": 36, "resolution": [40] * 2}
+    views = [look(name, middle, eye, up=up, **camera) for name, eye, up in eyes]
     density = droplets(points, reach, 0.4, 0.4, seed=3)
     return Case({"density": density}, times, bounds | cloud_optics(120), sun(0.15, 0.1, -1), views)
 
@@ -219,7 +210,7 @@ def ring(count: int, distance: float, **camera: Any) -> list[View]:
         eyes.append((f"train_{number}", around))
     eyes += [(f"test_{n}", eye) for n, eye in enumerate([(2.0, 1.6, 2.0), (-2.4, -0.8, 2.0)])]
     camera |= {"up": [0, 1, 0], "fov": 28}
-    return [perspective(name, (0, 0, 0), eye, **camera) for name, eye in eyes]
+    return [look(name, (0, 0, 0), eye, **camera) for name, eye in eyes]
 
 
 def solid() -> Case:

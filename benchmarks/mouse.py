@@ -1,6 +1,6 @@
 """Fluence in the digital mouse beside photons of uMCX: a body of 21 tissues, lit from above.
 
-    python benchmarks/mouse.py FOLDER [--photons 3e6]
+    python benchmarks/mouse.py FOLDER
 
 FOLDER has `digimouse.json` of github.com/fangq/mcx, and `umcx`, built from github.com/fangq/umcx
 with one thread. The index of refraction is 1 everywhere: ours has one for the whole box.
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from figures import ddrecon, print_header, print_row
 
+PHOTONS = 3_000_000
 LAYERS = ((0, 2), (2, 4), (4, 8), (8, 12), (12, 20))
 """Depths below the skin [mm]."""
 
@@ -36,7 +37,7 @@ def read_mouse(path: Path, every: int) -> tuple[np.ndarray, float, list[dict[str
 
 
 def trace_photons(
-    folder: Path, program: Path, labels: np.ndarray, width: float, media: list[dict], photons: int
+    folder: Path, program: Path, labels: np.ndarray, width: float, media: list[dict]
 ) -> tuple[np.ndarray, float]:
     """Fluence [x, y, z] by photons, as large as that of an irradiance of 1, and seconds."""
     # Photons end where they enter label 0 from a tissue: the air gets a label of its own.
@@ -54,7 +55,7 @@ def trace_photons(
     source |= {"Param1": [x, 0, 0, 0], "Param2": [0, y, 0, 0]}
     off = {"DoMismatch": False, "DoPartialPath": False}
     job = {
-        "Session": {"ID": "mouse", "Photons": photons, "OutputType": "x"} | off,
+        "Session": {"ID": "mouse", "Photons": PHOTONS, "OutputType": "x"} | off,
         "Forward": {"T0": 0, "T1": 5e-6, "Dt": 5e-6},
         "Domain": {
             "LengthUnit": width,
@@ -112,19 +113,15 @@ def main() -> None:
     """Prints a row for every coarseness of voxels."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--photons", type=float, default=3e6)
-    options = parser.parse_args()
-    folder = options.folder.resolve()
+    folder = parser.parse_args().folder.resolve()
     depths = [f"{low} to {high} mm" for low, high in LAYERS]
     print_header("voxels", "absorbed, uMCX", "absorbed, ours", *depths, "uMCX s", "ours s")
     for every in (4, 2):
         labels, width, media = read_mouse(folder / "digimouse.json", every)
         with tempfile.TemporaryDirectory() as place:
-            work, photons = Path(place), int(options.photons)
-            theirs, their_seconds = trace_photons(
-                work, folder / "umcx", labels, width, media, photons
-            )
-            ours, seconds = render_fluence(work, labels, width, media)
+            body = labels, width, media
+            theirs, their_seconds = trace_photons(Path(place), folder / "umcx", *body)
+            ours, seconds = render_fluence(Path(place), *body)
         depth = width * np.cumsum((labels > 0)[..., ::-1], axis=2)[..., ::-1]
         layers = [(labels > 0) & (depth > low) & (depth <= high) for low, high in LAYERS]
         ratios = [ours[layer].mean() / theirs[layer].mean() - 1 for layer in layers]

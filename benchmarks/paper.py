@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -117,12 +118,16 @@ def show_density(truth: str, front: str) -> Shown:
     return shown
 
 
-def show_light(runs: Runs) -> tuple[list[Pair], str]:
-    """The bunny, and the color of its light."""
-    run = first(runs)
-    found = round_values(run.number("lights.0.irradiance"))
-    views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
-    return views, f"irradiance {found}, in truth [3.2, 2.1, 1.2]"
+def show_numbers(*names: str, truth: str = "") -> Shown:
+    """What to show of a run that looks for numbers: its views, and what was found."""
+
+    def shown(runs: Runs) -> tuple[list[Pair], str]:
+        run = first(runs)
+        words = "; ".join(f"{name} {round_values(run.number(name))}" for name in names)
+        views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
+        return views, words + truth
+
+    return shown
 
 
 def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
@@ -136,58 +141,39 @@ def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
     return pairs, "last loss " + ", ".join(losses)
 
 
-def show_optics(runs: Runs) -> tuple[list[Pair], str]:
-    """Absorption and scattering coefficients in the middle of the cloud, and g."""
-    run = first(runs)
-    fields = {name: run.field(name) for name in ("sigma_a", "sigma_s")}
-    density = shape("cloud", fields["sigma_a"])[..., None]
-    truths = [density * shape("cloud", field, name) for name, field in fields.items()]
-    ours = [density * field for field in fields.values()]
-    pairs, errors = compare_optics(truths, ours, middle, "middle slices")
-    alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
-    words = f"g {run.number('g'):.3f}{alone}, in truth -0.802; {errors}"
-    views = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
-    return [*views, *pairs], words
+def show_optics(
+    truth: str, front: str, flatten: Callable[[Array], Array], place: str, is_g_sought: bool
+) -> Shown:
+    """What to show of a run that looks for absorption and scattering of the shape `truth`: of red
+    and of green, flattened to a `place`.
+    """
 
+    def shown(runs: Runs) -> tuple[list[Pair], str]:
+        run = first(runs)
+        pairs = [run.view(front, "a view it was shown"), run.view("novel", "novel view")]
+        errors = []
+        for index, name in enumerate(("sigma_a", "sigma_s")):
+            found = run.field(name)
+            true = shape(truth, found)[..., None]
+            ours = (true if is_g_sought else run.field("density")[..., None]) * found
+            true = true * shape(truth, found, name)
+            title = ("absorption, red", "scattering, green")[index]
+            images = (flatten(field[..., index]) for field in (true, ours))
+            pairs.append(Pair(f"{title}, {place}", *images))
+            errors.append(f"{relative_l1(ours, true):.2f}")
+        words = f"relative L1 error of absorption and scattering {', '.join(errors)}"
+        if is_g_sought:
+            found, alone = (each.number("g") for each in runs.values())
+            words = f"g {found:.3f}, alone {alone:.3f}, in truth -0.802; {words}"
+        return pairs, words
 
-def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
-    """The colored smoke, and its coefficients along z."""
-    run, names = first(runs), ("sigma_a", "sigma_s")
-    density = run.field("density")
-    true = shape("smoke", density)[..., None]
-    truths = [true * shape("smoke", density, name) for name in names]
-    ours = [density[..., None] * run.field(name) for name in names]
-    pairs, errors = compare_optics(truths, ours, lambda field: project(field, 0, 1), "along z")
-    views = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
-    return [*views, *pairs], errors
-
-
-def compare_optics(
-    truths: Sequence[Array], ours: Sequence[Array], flatten: Callable[[Array], Array], words: str
-) -> tuple[list[Pair], str]:
-    """Absorption of red and scattering of green, flattened, and errors of both in all colors."""
-    pairs = [
-        Pair(
-            f"{title}, {words}", *(flatten(fields[index][..., index]) for fields in (truths, ours))
-        )
-        for index, title in enumerate(("absorption, red", "scattering, green"))
-    ]
-    errors = ", ".join(f"{relative_l1(o, t):.2f}" for o, t in zip(ours, truths, strict=True))
-    return pairs, f"relative L1 error of absorption and scattering {errors}"
+    return shown
 
 
 def show_four(runs: Runs) -> tuple[list[Pair], str]:
     """The smoke from all four sides, and from one that nobody knows."""
     sides = "front", "right", "back", "left", "novel"
     return [first(runs).view(name, name) for name in sides], "no true volume"
-
-
-def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
-    """The cloud, and what was found of its light."""
-    run = first(runs)
-    names = ("lights.0.irradiance", "lights.0.direction", "lights.1.radiance", "sigma_a", "sigma_s")
-    words = "; ".join(f"{name} {round_values(run.number(name))}" for name in names)
-    return [run.view("front", "the photograph"), run.view("novel", "novel view")], words
 
 
 def middle(field: Array) -> Array:
@@ -207,13 +193,11 @@ def round_values(values: float | list[float]) -> str:
 class Experiment:
     """How a config is run: by `variants`, names of runs with their overrides.
 
-    `shown` makes the pairs to draw and says what was found. `others` are variants too, whose logs
-    are not drawn.
+    `shown` makes the pairs to draw and says what was found.
     """
 
     shown: Shown
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"": ()})
-    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 G_ALONE = (
@@ -235,14 +219,26 @@ MODELS_13 = {
 PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
 EXPERIMENTS = {
     "fig13": Experiment(show_density("bunny", "ring_00")),
-    "fig06_light": Experiment(show_light),
+    "fig06_light": Experiment(
+        show_numbers("lights.0.irradiance", truth=", in truth [3.2, 2.1, 1.2]")
+    ),
     "fig06_density": Experiment(show_density("knot", "front")),
-    "fig10": Experiment(show_optics, others={"g_alone": G_ALONE}),
-    "fig12_single": Experiment(show_smoke),
+    "fig10": Experiment(
+        show_optics("cloud", "ring_00", middle, "middle slices", is_g_sought=True),
+        {"fields and g": (), "g alone": G_ALONE},
+    ),
+    "fig12_single": Experiment(
+        show_optics("smoke", "front", partial(project, axis=0, side=1), "along z", False)
+    ),
     "fig12_four": Experiment(show_four),
     "fig07": Experiment(show_density("cloud", "front")),
     "fig09": Experiment(show_derivatives, PARTS),
-    "fig14": Experiment(show_photograph),
+    "fig14": Experiment(
+        show_numbers(
+            *("lights.0.irradiance", "lights.0.direction", "lights.1.radiance"),
+            *("sigma_a", "sigma_s"),
+        )
+    ),
 }
 """By their configs, in the order of docs/experiments.md."""
 
@@ -282,9 +278,9 @@ def make_runs(
 def remake(name: str, output: Path, is_kept: bool) -> None:
     """Runs the experiment `name`, draws it, and prints its row."""
     experiment = EXPERIMENTS[name]
-    runs = make_runs(name, {**experiment.variants, **experiment.others}, output, is_kept)
+    runs = make_runs(name, experiment.variants, output, is_kept)
     pairs, words = experiment.shown(runs)
-    logs = {key: read_log(runs[key].folder) for key in experiment.variants}
+    logs = {key: read_log(run.folder) for key, run in runs.items()}
     draw(PICTURES / f"{name}.png", pairs, logs)
     print_found(name, read_log(first(runs).folder), words)
 

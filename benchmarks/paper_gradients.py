@@ -10,7 +10,6 @@ everywhere; for absorption, less and more. Pictures that are there already are n
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -46,63 +45,46 @@ MODELS = {
 """The paper's own scheme, and ours without and with transport rounds, as overrides."""
 
 
-@dataclass(frozen=True)
-class Change:
-    """The scenes `before`, `between` and `after` as overrides; `parameter` changes by `amount` in
-    all, from the first to the last.
-    """
-
-    parameter: str
-    amount: float
-    before: str
-    between: str
-    after: str
+Change = tuple[str, float, list[str]]
+"""A parameter, the amount by which it changes in all, and overrides: before, between and after."""
 
 
 def changes(folder: Path) -> list[Change]:
     """Both changes, with the volumes they need in `folder`."""
-    cloud = read_field(CLOUD, "density")
-    names = {"before": 0.0, "between": HAZE / 2, "after": HAZE}
-    for name, haze in names.items():
-        write_field(
-            folder / f"{name}.npz", "density", cloud.values + np.float32(haze), cloud.bounds
-        )
-    hazy = [f"volume.density={{file: {(folder / f'{name}.npz').resolve()}}}" for name in names]
-    return [
-        Change("density", HAZE, *hazy),
-        Change(
-            "sigma_a",
-            ABSORPTION,
-            *(f"volume.sigma_a={1 + ABSORPTION * part}" for part in (-0.5, 0, 0.5)),
-        ),
-    ]
+    cloud, hazy = read_field(CLOUD, "density"), []
+    for part in (0, 0.5, 1):
+        path = (folder / f"{part}.npz").resolve()
+        write_field(path, "density", cloud.values + np.float32(part * HAZE), cloud.bounds)
+        hazy.append(f"volume.density={{file: {path}}}")
+    black = [f"volume.sigma_a={1 + part * ABSORPTION}" for part in (-0.5, 0, 0.5)]
+    return [("density", HAZE, hazy), ("sigma_a", ABSORPTION, black)]
 
 
 def trace_derivative(change: Change, folder: Path) -> tuple[Array, float]:
     """The derivative image [h, w] from path tracing, and the standard error of its pixels (root
     mean square).
     """
+    parameter, amount, (before, _, after) = change
     pictures, variance = [], 0.0
-    for name, override in (("before", change.before), ("after", change.after)):
-        output = folder / f"{change.parameter}_{name}"
+    for name, override in (("before", before), ("after", after)):
+        output = folder / f"{parameter}_{name}"
         if not (output / "reference.json").exists():
-            ddrecon(
-                "reference", CONFIG, "-o", output, "--views", "--spp", str(PATHS), "-D", override
-            )
+            options = "--views", "--spp", str(PATHS), "-D", override
+            ddrecon("reference", CONFIG, "-o", output, *options)
         picture = np.load(output / "front.npy").mean(-1)
         noise = json.loads((output / "reference.json").read_text())["views"]["front"]["noise"]
         variance += noise**2 * float((picture**2).mean())
         pictures.append(picture)
-    return (pictures[1] - pictures[0]) / change.amount, variance**0.5 / change.amount
+    return (pictures[1] - pictures[0]) / amount, variance**0.5 / amount
 
 
 def differentiate(change: Change, folder: Path, model: str) -> Array:
     """The derivative [h, w] of the image by one of `MODELS`."""
-    output = folder / f"{change.parameter}_{model[0]}"
-    options = as_options([change.between, *MODELS[model]])
-    ddrecon("render", CONFIG, "-o", output, "--gradient", change.parameter, *options)
-    mean: Array = np.load(output / "front.gradient.npy").mean(-1)
-    return mean
+    parameter, _, (_, between, _) = change
+    output = folder / f"{parameter}_{model[0]}"
+    options = as_options([between, *MODELS[model]])
+    ddrecon("render", CONFIG, "-o", output, "--gradient", parameter, *options)
+    return np.load(output / "front.gradient.npy").mean(-1)
 
 
 def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
@@ -110,11 +92,8 @@ def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
     black = ["volume.sigma_s=0", "volume.sigma_a=12", "lights=[{type: ambient, radiance: 1}]"]
     ddrecon("render", CONFIG, "-o", folder / "through", *as_options(black))
     through = np.load(folder / "through" / "front.npy").mean(-1)
-    return {
-        "thick": through < 0.2,
-        "thin": (through >= 0.2) & (through < 0.95),
-        "empty": through >= 0.95,
-    }
+    thick, empty = through < 0.2, through >= 0.95
+    return {"thick": thick, "thin": ~thick & ~empty, "empty": empty}
 
 
 def relative_error(image: Array, truth: Array) -> float:
@@ -132,30 +111,18 @@ def remake(folder: Path) -> None:
     for row, change in zip(axes, changes(folder), strict=True):
         truth, noise = trace_derivative(change, folder)
         full = float(np.quantile(np.abs(truth), 0.99))
-        row[0].set_ylabel(f"by {change.parameter}")
+        row[0].set_ylabel(f"by {change[0]}")
         show_signed(row[0], truth, full, "differences of\npath tracing")
         for column, name in enumerate(MODELS, 1):
             image = differentiate(change, folder, name)
-            print_error(change, name, image, truth, noise, seen)
+            errors = (f"{at} {relative_error(image[m], truth[m]):.3f}" for at, m in seen.items())
+            share = noise / float(np.sqrt((truth**2).mean()))
+            alike = float(np.corrcoef(image.ravel(), truth.ravel())[0, 1])
+            error = relative_error(image, truth)
+            print_row(change[0], name, share, error, ", ".join(errors), alike)
             show_signed(row[column], image, full, f"ours, {name}")
             away = row[column + count]
             show(away, np.abs(image - truth), full / ENLARGED, "inferno")
-            words = f"{ENLARGED} x |error|,\nours, {name}: {relative_error(image, truth):.2f}"
+            words = f"{ENLARGED} x |error|,\nours, {name}: {error:.2f}"
             away.set_title(words, fontsize=8)
     save(figure, PICTURE)
-
-
-def print_error(
-    change: Change,
-    name: str,
-    image: Array,
-    truth: Array,
-    noise: float,
-    seen: dict[str, NDArray[np.bool_]],
-) -> None:
-    """Prints a row: errors of `image`, and the `noise` there is in truth, or in it."""
-    errors = ((region, relative_error(image[at], truth[at])) for region, at in seen.items())
-    words = ", ".join(f"{region} {error:.3f}" for region, error in errors)
-    alike = float(np.corrcoef(image.ravel(), truth.ravel())[0, 1])
-    share = noise / float(np.sqrt((truth**2).mean()))
-    print_row(change.parameter, name, share, relative_error(image, truth), words, alike)

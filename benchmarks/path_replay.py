@@ -1,7 +1,7 @@
 """Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021): the plume's image and
 its gradient by every cell's density, by us and by it.
 
-    DRJIT_LIBLLVM_PATH=... python benchmarks/path_replay.py [--pixels 512] [--paths 4 16]
+    DRJIT_LIBLLVM_PATH=... python benchmarks/path_replay.py [--paths 4 16]
 
 Times are of this run only, on as many threads for both. Gradients are compared as sums of density
 times gradient over blocks of 4^3 cells, each with that of the most paths. Needs the variant
@@ -111,13 +111,11 @@ def by_amount(shot: Shot, density: Tensor) -> Tensor:
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--pixels", type=int, default=512)
-    parser.add_argument("--cells", type=int, default=64)
     parser.add_argument("--paths", type=int, nargs="+", default=[4, 16])
     given = parser.parse_args()
     if lacking := why_not():
         raise SystemExit(f"path replay {lacking}")
-    scene = plume_scene(given.cells, given.pixels, torch.float32, torch.device("cpu"))
+    scene = plume_scene(64, 512, torch.float32, torch.device("cpu"))
     replay = Replay.of(scene)
     rows = {"ours": [shoot(scene) for _ in range(REPEATS + 1)][1:]}
     replay_shot(replay, 1, len(given.paths))  # compiles
@@ -126,10 +124,8 @@ def main() -> None:
     print_header("", "image s", "gradient s", "both s", "times ours", "correlation")
     best, base = by_amount(list(rows.values())[-1][0], scene.volume.density), 0.0
     for name, shots in rows.items():
-        image, gradient = (
-            median(part)
-            for part in zip(*((s.image_seconds, s.gradient_seconds) for s in shots), strict=True)
-        )
+        image = median(shot.image_seconds for shot in shots)
+        gradient = median(shot.gradient_seconds for shot in shots)
         base = base or image + gradient
         found = by_amount(shots[0], scene.volume.density)
         correlation = float(torch.corrcoef(torch.stack([found, best]))[0, 1])

@@ -25,6 +25,7 @@ from ddrecon.io.volumes.table import read_field
 CAPTURE, FILM = ROOT / "data/capture", ROOT / "data/film"
 LAMP, SUN = (7.3, 7.0, 6.4), (0.8, -0.45, -0.4)
 """Irradiance and direction of the light by which pictures of the capture and film were made."""
+SHIFT = "where cameras see the smoke [pixels]"
 FRAMES = 5
 """Frames of the film that are reconstructed, from the first on."""
 PLUME = {
@@ -58,9 +59,7 @@ def rotation_between(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.degrees(2 * np.arcsin(min(chord, 1))))
 
 
-def pixels_off(
-    found: np.ndarray, true: np.ndarray, focal: float, smoke: Path = CAPTURE / "density.npz"
-) -> float:
+def pixels_off(found: np.ndarray, true: np.ndarray, focal: float, smoke: Path) -> float:
     """How far the camera `found` sees the `smoke` from where `true` does [pixels], on average."""
     density = read_density(smoke)
     low, high = np.load(smoke)["bounds"]
@@ -74,36 +73,38 @@ def pixels_off(
     return float(focal * np.average(angles, weights=density[density > 0]))
 
 
+def cameras_off(poses: list[Any], frames: list[Any], smoke: Path) -> np.ndarray:
+    """By how far each of the `poses` is turned [degrees], and off in the picture [pixels]."""
+    errors = []
+    for pose, frame in zip(poses, frames, strict=True):
+        both = [np.array(matrix)[:3] for matrix in (pose, frame["transform_matrix"])]
+        errors.append((rotation_between(*both), pixels_off(*both, frame["fl_x"], smoke)))
+    return np.array(errors)
+
+
 def print_capture(folder: Path) -> None:
     """Runs the capture, and prints what it found beside what its cameras were told."""
     row = measure(CONFIGS["capture"], folder)
     values = json.loads((folder / "parameters.json").read_text())
-    told, truth = (
-        json.loads((CAPTURE / name).read_text())["frames"]
-        for name in ("transforms.json", "truth.json")
+    files = (CAPTURE / name for name in ("transforms.json", "truth.json"))
+    told, truth = (json.loads(file.read_text())["frames"][:-1] for file in files)
+    names = [f"views.{Path(frame['file_path']).stem}" for frame in truth]
+    exposures = [frame["exposure"] for frame in truth]
+    gains = np.divide([values[f"{name}.exposure"] for name in names], exposures)
+    lamp = np.divide(values["lights.0.irradiance"], LAMP)
+    poses = (
+        [frame["transform_matrix"] for frame in told],
+        [values[f"{name}.camera"]["matrix"] for name in names],
     )
-    gains, turns, shifts = [], [], []
-    for start, frame in zip(told[:-1], truth[:-1], strict=True):
-        name, true = Path(frame["file_path"]).stem, np.array(frame["transform_matrix"])[:3]
-        gain = np.divide(values[f"views.{name}.exposure"], frame["exposure"])
-        gains.append(100 * np.abs(gain - 1))
-        poses = start["transform_matrix"], values[f"views.{name}.camera"]["matrix"]
-        both = [np.array(pose)[:3] for pose in poses]
-        turns.append([rotation_between(pose, true) for pose in both])
-        shifts.append([pixels_off(pose, true, frame["fl_x"]) for pose in both])
-    lamp = 100 * (np.divide(values["lights.0.irradiance"], LAMP) - 1)
-    span = "{:.2f} to {:.2f}".format
+    given, found = (cameras_off(each, truth, CAPTURE / "density.npz").T for each in poses)
     print_header("what", "given", "found")
     print_row("held-out picture, as displayed", "", f"{row['held out'][0]:.1f} dB")
     print_row("density, relative L1 error", "", *row["L1"])
-    print_row("exposures, mean error", "", f"{np.mean(gains):.1f} %")
-    print_row("exposures, worst error", "", f"{np.max(gains):.1f} %")
-    print_row("lamp, error by color", "", ", ".join(f"{part:+.0f} %" for part in lamp))
-    for what, pairs in (
-        ("where cameras see the smoke [pixels]", shifts),
-        ("turn [degrees]", turns),
-    ):
-        print_row(what, *(span(min(part), max(part)) for part in zip(*pairs, strict=True)))
+    print_row("exposures, mean error", "", f"{100 * np.abs(gains - 1).mean():.1f} %")
+    print_row("exposures, worst error", "", f"{100 * np.abs(gains - 1).max():.1f} %")
+    print_row("lamp, error by color", "", ", ".join(f"{part:+.0f} %" for part in 100 * (lamp - 1)))
+    for what, *pair in zip(("turn [degrees]", SHIFT), given, found, strict=True):
+        print_row(what, *(f"{errors.min():.2f} to {errors.max():.2f}" for errors in pair))
     print_row("seconds of the process", "", f"{row['seconds'][0]:.0f}")
 
 
@@ -113,22 +114,15 @@ def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], Used]:
     return json.loads((folder / "film.json").read_text()), used
 
 
-def calibration_errors(values: dict[str, Any], number: int) -> dict[str, float]:
-    """How far `values`, by variable, are from the truth, by the smoke of the frame `number`."""
-    turns, shifts = [], []
+def calibration_errors(values: dict[str, Any], number: int) -> tuple[float, float, float]:
+    """Mean errors of cameras by the smoke of the frame `number`, and the lamp's [degrees]."""
     truth = json.loads((FILM / "truth.json").read_text())
-    for frame in truth["frames"]:
-        if frame["file_path"] in truth["train_filenames"]:
-            found = values[f"views.{frame['file_path'].partition('_{')[0]}.camera"]
-            poses = [np.array(each)[:3] for each in (found["matrix"], frame["transform_matrix"])]
-            turns.append(rotation_between(*poses))
-            shifts.append(pixels_off(*poses, frame["fl_x"], FILM / f"density_{number:04d}.npz"))
+    frames = [frame for frame in truth["frames"] if frame["file_path"] in truth["train_filenames"]]
+    names = (frame["file_path"].partition("_{")[0] for frame in frames)
+    poses = [values[f"views.{name}.camera"]["matrix"] for name in names]
+    turn, shift = cameras_off(poses, frames, FILM / f"density_{number:04d}.npz").mean(0)
     sun, true = (np.divide(one, np.linalg.norm(one)) for one in (values["lights.0.direction"], SUN))
-    return {
-        "directions of cameras, mean error [degrees]": float(np.mean(turns)),
-        "where cameras see the smoke, mean error [pixels]": float(np.mean(shifts)),
-        "direction of the lamp, error [degrees]": float(np.degrees(np.arccos(sun @ true))),
-    }
+    return turn, shift, float(np.degrees(np.arccos(sun @ true)))
 
 
 def flicker(folder: Path, numbers: Sequence[int]) -> float:
@@ -151,16 +145,16 @@ def print_film(folder: Path) -> None:
     for what, key in (("held out", "test_psnr"), ("the same, registered", "registered_psnr")):
         print_row(f"{what}, last frame [dB]", f"{one[key]:.1f}", f"{other[key]:.1f}")
     in_film = [row["seconds"] for row in film["frames"][1:]]
-    print_row(
-        "seconds of a frame, later ones", f"{np.mean(in_film):.1f}", f"{other['seconds']:.1f}"
-    )
+    seconds = np.mean(in_film), other["seconds"]
+    print_row("seconds of a frame, later ones", *(f"{taken:.1f}" for taken in seconds))
     both = used, used_alone
     print_row("seconds of the process", *(f"{taken.seconds:.0f}" for taken in both))
     print_row("most memory of the process [MiB]", *(f"{taken.memory:.0f}" for taken in both))
     values = json.loads((folder / f"alone/frames/{number:04d}/parameters.json").read_text())
     errors = calibration_errors(film["values"], number), calibration_errors(values, number)
-    for what in errors[0]:
-        print_row(what, *(f"{each[what]:.2f}" for each in errors))
+    names = "turn of cameras [degrees]", SHIFT, "turn of the lamp [degrees]"
+    for what, *pair in zip(names, *errors, strict=True):
+        print_row(what, *(f"{error:.2f}" for error in pair))
     print_row("flicker of cells", f"{flicker(folder / 'film', range(FRAMES)):.2f}", "")
 
 

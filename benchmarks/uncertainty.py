@@ -1,6 +1,6 @@
 """Is the uncertainty true? How often the truth lies within what `ddrecon uncertainty` says.
 
-    python benchmarks/uncertainty.py [NAME]... [--references FOLDER]
+    python benchmarks/uncertainty.py [--references FOLDER]
 
 Volumes that are known are reconstructed from path-traced pictures, and each cell's error is held
 against its deviation. What FOLDER/uncertainty does not hold of pictures is traced by Mitsuba 3
@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -73,7 +72,7 @@ def trace_ball(folder: Path) -> Known:
     return replace(scene, views=views), read_density("ball/density")
 
 
-def judge(known: Known, experiments: int) -> dict[str, Any]:
+def judge(known: Known, experiments: int) -> tuple[object, ...]:
     """How often the truth is within one and two deviations, of cells that hold smoke in truth.
 
     And how far ranks of errors and deviations agree, there and in the whole box.
@@ -87,18 +86,18 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
         deviations.step()
     field, truth = deviations.fields()["density"], resample(truth, run.level.train.volume.grid)
     smoke, error = truth > EMPTY * truth.max(), (field.value - truth).abs()
-    row: dict[str, Any] = {"cells": int(smoke.sum())}
-    sizes = (error / field.deviation)[smoke]
+    sizes, told = (error / field.deviation)[smoke], field.describe()
     within = [f"{100 * float((sizes < k).double().mean()):.0f}" for k in (1, 2)]
-    row["within 1, 2 [%]"] = ", ".join(within)
-    told = field.describe()
-    row["in experiments [%]"] = ", ".join(f"{100 * (told[f'within_{k}'] or 0):.0f}" for k in (1, 2))
-    row["rank correlation"] = f"{correlate_ranks(error[smoke], field.deviation[smoke]):.2f}"
-    row["over all cells"] = f"{correlate_ranks(error, field.deviation):.2f}"
+    expected = [f"{100 * (told[f'within_{k}'] or 0):.0f}" for k in (1, 2)]
+    ranks = (
+        correlate_ranks(error[smoke], field.deviation[smoke]),
+        correlate_ranks(error, field.deviation),
+    )
     number = deviations.numbers()["mass of density"]
-    mass, deviation = number["value"], number["deviation"]
-    true = mass * float(truth.double().sum() / field.value.sum())
-    return row | {"mass off [deviations]": f"{(mass - true) / deviation:+.1f}"}
+    off = number["value"] * (1 - float(truth.double().sum() / field.value.sum()))
+    shares = ", ".join(within), ", ".join(expected)
+    mass = f"{off / number['deviation']:+.1f}"
+    return int(smoke.sum()), *shares, *(f"{rank:.2f}" for rank in ranks), mass
 
 
 def correlate_ranks(one: Tensor, other: Tensor) -> float:
@@ -113,18 +112,15 @@ def correlate_ranks(one: Tensor, other: Tensor) -> float:
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("names", nargs="*", help="only these volumes")
     parser.add_argument("--references", type=Path)
     parser.add_argument("--calibrate", type=int, default=2)
     options = parser.parse_args()
     use_engine("auto")
     torch.manual_seed(0)
-    cases = known_cases(options.references)
-    for number, name in enumerate(options.names or cases):
-        row = {"volume": name} | judge(cases[name](), options.calibrate)
-        if number == 0:
-            print_header(*row)
-        print_row(*row.values())
+    heads = ("volume", "cells", "within 1, 2 [%]", "in experiments [%]")
+    print_header(*heads, "rank correlation", "over all cells", "mass off [deviations]")
+    for name, case in known_cases(options.references).items():
+        print_row(name, *judge(case(), options.calibrate))
 
 
 if __name__ == "__main__":
