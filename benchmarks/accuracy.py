@@ -52,8 +52,6 @@ Vector = tuple[float, float, float]
 KnownCase = tuple[str, Path, Traced]
 """A name, a scene file that holds until the next one is written, and its path-traced image."""
 CELLS, PIXELS = 48, 32
-LIGHT = ("direction", "irradiance", "radiance")
-"""What is taken of the lights of the eleven cases."""
 MODELS = {
     "n = 0": ("diffusion.transport_rounds=0",),
     **{f"n = {n}": (f"diffusion.transport_rounds={n}", "diffusion.degree=3") for n in (1, 2, 3)},
@@ -255,8 +253,11 @@ def known_cases(folder: Path, place: Path) -> Iterator[KnownCase]:
         bounds = np.array([[sign * side for side in case["extent"]] for sign in (-0.5, 0.5)])
         lights = []
         for light in case["light"]:
+            known = {
+                key: light[key] for key in light.keys() & {"irradiance", "radiance", "direction"}
+            }
             kind = "ambient" if light["type"] == "constant" else light["type"]
-            lights.append({"type": kind} | {key: light[key] for key in light if key in LIGHT})
+            lights.append(known | {"type": kind})
         density = folder / "images" / f"{case['volume']}_density.npz"
         camera["type"] = "perspective"
         path = write_scene(place, density, bounds, medium, lights, camera, case["resolution"])

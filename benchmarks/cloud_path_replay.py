@@ -30,7 +30,7 @@ import torch
 import yaml
 from figures import ROOT, ddrecon, print_header, print_row
 from inverse_scenes import coarsened, look
-from path_replay import Replay, why_not
+from path_replay import Replay
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -94,12 +94,6 @@ def trace_pictures(path: Path, folder: Path) -> None:
         for second in range(1 + view.is_test):
             image = tracer.trace(index, 2 * index + second, PATHS)
             np.save(folder / f"{view.name}{'.second' * second}.npy", image.astype(np.float32))
-
-
-def by_us(path: Path, folder: Path) -> tuple[np.ndarray, float]:
-    """The density [z, y, x] that `ddrecon optimize` finds, and its processor seconds."""
-    seconds = ddrecon("optimize", path, "-o", folder / "ours", "--threads", "1").processor
-    return read_field(folder / "ours/volumes/density.npz", "density").values, seconds
 
 
 def by_path_replay(scene: Scene, rate: float, seconds: float) -> tuple[np.ndarray, int]:
@@ -171,8 +165,6 @@ def main() -> None:
     parser.add_argument("cloud", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "cloud_path_replay")
     given = parser.parse_args()
-    if lacking := why_not():
-        raise SystemExit(f"path replay {lacking}")
     torch.set_num_threads(1)
     folder = given.output.resolve()
     folder.mkdir(parents=True, exist_ok=True)
@@ -188,8 +180,11 @@ def main() -> None:
         psnr = f"{held_out(scene, density, folder):.1f} dB"
         print_row(who, psnr, error, mass, iterations, f"{seconds:.0f}")
 
-    density, seconds = by_us(path, folder)
-    judge("ours", density, len((folder / "ours/loss.csv").read_text().splitlines()) - 1, seconds)
+    ours = folder / "ours"
+    seconds = ddrecon("optimize", path, "-o", ours, "--threads", "1").processor
+    iterations = json.loads((ours / "summary.json").read_text())["iterations"]
+    density = read_field(ours / "volumes/density.npz", "density").values
+    judge("ours", density, iterations, seconds)
     for rate in RATES:
         density, iterations = by_path_replay(scene, rate, seconds)
         judge(f"path replay, rate {rate:g}", density, iterations, seconds)

@@ -23,17 +23,14 @@ from figures import print_header, print_row
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "exact"))
 from published import PHASES, Layer, StepCloud, percent_off
 
-ROUNDS, DEGREES = (1, 4, 16), (3, 5)
-
-
-def by_dial(rounds: int, degree: int) -> tuple[str, str]:
-    return f"diffusion.transport_rounds={rounds}", f"diffusion.degree={degree}"
-
-
 MODELS: dict[str, tuple[str, ...]] = {
     "default": (),
     "n = 0": ("diffusion.transport_rounds=0",),
-    **{f"L = {degree}, n = {n}": by_dial(n, degree) for degree in DEGREES for n in ROUNDS},
+    **{
+        f"L = {degree}, n = {n}": (f"diffusion.transport_rounds={n}", f"diffusion.degree={degree}")
+        for degree in (3, 5)
+        for n in (1, 4, 16)
+    },
 }
 """Overrides by column: n transport rounds of degree L."""
 SUNS = {"overhead": 1.0, "60 degrees": 0.5}

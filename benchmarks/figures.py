@@ -25,14 +25,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
+TRACED = "eleven", "derivative", "angles", "volumes", "grounds"
 COMMANDS = {
-    "eleven": "python benchmarks/accuracy.py eleven --references FOLDER",
-    "angles": "python benchmarks/accuracy.py angles --references FOLDER",
-    "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
-    "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
+    **{name: f"python benchmarks/accuracy.py {name} --references FOLDER" for name in TRACED},
     "thick": "python benchmarks/accuracy.py thick",
     "layers": "python benchmarks/dial.py",
-    "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
     "plume": "python benchmarks/reconstruction.py plume",
     "capture": "python benchmarks/reconstruction.py capture",
     "film": "python benchmarks/reconstruction.py film",

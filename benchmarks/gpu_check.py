@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 from figures import ROOT
-from runs import CONFIGS, start_config, start_paper_case, start_plume, start_run
+from runs import CONFIGS, apart, start_config, start_paper_case, start_plume, start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
@@ -207,11 +207,6 @@ def agree(check: Check) -> Iterator[str]:
     assert all(error <= AGREEMENT for error in farthest), f"farther than {AGREEMENT}"
 
 
-def apart(one: Tensor, other: Tensor) -> float:
-    """How far two tensors are apart, relative to the second."""
-    return float((one.cpu() - other.cpu()).norm() / other.norm().clamp(min=1e-300))
-
-
 def speed(check: Check) -> Iterator[str]:
     """Iterations: seconds, what is launched and waited for, how busy the device is, memory."""
     yield (
@@ -313,15 +308,12 @@ def optimize(check: Check) -> Iterator[str]:
     """The plume from the command line, as anybody runs it."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["-m", "ddrecon", "optimize", str(CONFIGS / "plume.yaml"), "-o", folder]
-        command += ["--overwrite", "--device", check.device.type]
-        if check.shrink == 1:
-            command += ["--engine", check.engine]
-        else:
-            sizes = [size // check.shrink for size in (64, 96, 64)]
-            command += ["--iterations", "3", "-D", f"volume.resolution={sizes}"]
-            command += ["--engine", "torch"]  # which compiles nothing
+        command += ["--overwrite", "--device", check.device.type, "--engine"]
+        sizes = [size // check.shrink for size in (64, 96, 64)]
+        few = ["torch", "--iterations", "3", "-D", f"volume.resolution={sizes}"]
         start = time.perf_counter()
-        end = run_python(*command)
+        # The engine torch compiles nothing.
+        end = run_python(*command, *([check.engine] if check.shrink == 1 else few))
         yield "\n".join((end.stdout + end.stderr[-600:]).splitlines()[-12:])
         yield f"exit {end.returncode}, {time.perf_counter() - start:.1f} s the whole process"
         assert end.returncode == 0

@@ -204,11 +204,10 @@ def at3d(depth: int) -> Case:
 def ring(count: int, distance: float, **camera: Any) -> list[View]:
     """Views around the origin, and two that are held out, from above and below."""
     eyes = []
-    for number in range(count):
-        angle = 2 * math.pi * number / count
+    for number, angle in enumerate(2 * math.pi * np.arange(count) / count):
         around = distance * math.sin(angle), 0.1 * distance, distance * math.cos(angle)
         eyes.append((f"train_{number}", around))
-    eyes += [(f"test_{n}", eye) for n, eye in enumerate([(2.0, 1.6, 2.0), (-2.4, -0.8, 2.0)])]
+    eyes += [("test_0", (2.0, 1.6, 2.0)), ("test_1", (-2.4, -0.8, 2.0))]
     camera |= {"up": [0, 1, 0], "fov": 28}
     return [look(name, (0, 0, 0), eye, **camera) for name, eye in eyes]
 
@@ -220,11 +219,9 @@ def solid() -> Case:
     blobs = [  # x, y, z, radii, and how far each leans along x
         ((0.03, -0.34, 0), (0.31, 0.27, 0.25), 0.0),
         ((-0.2, 0.06, 0), (0.17, 0.16, 0.14), 0.0),
-        ((-0.08, 0.38, 0.09), (0.05, 0.24, 0.045), 0.25),
-        ((-0.08, 0.38, -0.09), (0.05, 0.24, 0.045), 0.25),
+        *(((-0.08, 0.38, z), (0.05, 0.24, 0.045), 0.25) for z in (0.09, -0.09)),
         ((0.35, -0.42, 0), (0.09, 0.09, 0.09), 0.0),
-        ((-0.22, -0.56, 0.16), (0.13, 0.06, 0.07), 0.0),
-        ((-0.22, -0.56, -0.16), (0.13, 0.06, 0.07), 0.0),
+        *(((-0.22, -0.56, z), (0.13, 0.06, 0.07), 0.0) for z in (0.16, -0.16)),
     ]
     density = np.zeros(points.shape[:3])
     for middle, radii, lean in blobs:

@@ -28,7 +28,6 @@ CASES: dict[str, tuple[dict[str, object], dict[str, object], tuple[str, ...]]] =
     "RGB": (RGB, {}, ()),
     "RGB, g 0.3": (RGB | {"g": 0.3}, {}, ()),
     "RGB, g 0.3, one round": (RGB | {"g": 0.3}, ONE_ROUND, ()),
-    "RGB, g 0.3, degree 5": (RGB | {"g": 0.3}, ONE_ROUND | {"degree": 5}, ()),
     "RGB, flux-limited": (RGB, {"model": "flux_limited"}, ()),
     "RGB fields": (RGB, {}, ("albedo",)),
     "density, sigma_a and sigma_s": (BOTH, {}, ("sigma_a", "sigma_s")),

@@ -44,25 +44,17 @@ def trace_photons(
     filled = np.where(labels, labels, len(media)).astype(np.uint8)
     clear = {"mua": 0.0, "mus": 0.0, "g": 1.0}
     x, y, z = labels.shape
-    shapes = {
-        "_ArrayType_": "uint8",
-        "_ArraySize_": [x, y, z],
-        "_ArrayZipType_": "zlib",
-        "_ArrayZipSize_": filled.size,
-        "_ArrayZipData_": base64.b64encode(zlib.compress(filled.tobytes())).decode(),
-    }
+    shapes = {"_ArrayType_": "uint8", "_ArraySize_": [x, y, z], "_ArrayZipSize_": filled.size}
+    packed = base64.b64encode(zlib.compress(filled.tobytes())).decode()
+    shapes |= {"_ArrayZipType_": "zlib", "_ArrayZipData_": packed}
     source = {"Type": "planar", "Pos": [0, 0, z - 1e-3], "Dir": [0, 0, -1, 0]}
     source |= {"Param1": [x, 0, 0, 0], "Param2": [0, y, 0, 0]}
+    rows = [row | {"n": 1.0} for row in [clear, *media[1:], clear]]
     off = {"DoMismatch": False, "DoPartialPath": False}
     job = {
         "Session": {"ID": "mouse", "Photons": PHOTONS, "OutputType": "x"} | off,
         "Forward": {"T0": 0, "T1": 5e-6, "Dt": 5e-6},
-        "Domain": {
-            "LengthUnit": width,
-            "Dim": [x, y, z],
-            "OriginType": 1,
-            "Media": [row | {"n": 1.0} for row in [clear, *media[1:], clear]],
-        },
+        "Domain": {"LengthUnit": width, "Dim": [x, y, z], "OriginType": 1, "Media": rows},
         "Optode": {"Source": source, "Detector": []},
         "Shapes": shapes,
     }

@@ -22,32 +22,12 @@ import paper_gradients
 import torch
 import yaml
 from figures import ROOT, as_options, ddrecon, print_header, print_row
-from paper_figures import (
-    CONFIGS,
-    PICTURES,
-    SHAPES,
-    Array,
-    Log,
-    Pair,
-    draw,
-    pace,
-    project,
-    read_log,
-)
+from paper_figures import CONFIGS, PICTURES, SHAPES, Array, Log, Pair, draw, pace, project, read_log
 
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import resample
-
-HEADS = (
-    *("config", "iterations", "seconds an iteration", "forward, adjoint iterations of the solves"),
-    *("loss", "PSNR shown, novel", "found"),
-)
-HEADS_13 = (
-    *("model", "iterations", "seconds", "PSNR shown, novel", "L1 error of the density"),
-    *("in the lowest third", "density there, in truth 1"),
-)
 
 
 @dataclass(frozen=True)
@@ -287,7 +267,8 @@ def remake(name: str, output: Path, is_kept: bool) -> None:
 
 def compare_models(output: Path, is_kept: bool) -> None:
     """Fig. 13 by several models: a picture of the densities, and a table."""
-    print_header(*HEADS_13)
+    heads = "model", "iterations", "seconds", "PSNR shown, novel", "L1 error of the density"
+    print_header(*heads, "in the lowest third", "density there, in truth 1")
     pairs = []
     for name, run in make_runs("fig13", MODELS_13, output, is_kept).items():
         density, log = run.field("density"), read_log(run.folder)
@@ -316,7 +297,8 @@ def main() -> None:
     elif given.name == "fig13":
         compare_models(given.output, given.keep)
     else:
-        print_header(*HEADS)
+        solves = "seconds an iteration", "forward, adjoint iterations of the solves"
+        print_header("config", "iterations", *solves, "loss", "PSNR shown, novel", "found")
         for name in [given.name] if given.name else EXPERIMENTS:
             remake(name, given.output, given.keep)
 

@@ -12,24 +12,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from figures import as_options, ddrecon, print_header, print_row
 from numpy.typing import NDArray
-from paper_figures import (
-    CONFIGS,
-    PICTURES,
-    SHAPES,
-    Array,
-    save,
-    show,
-    show_signed,
-)
+from paper_figures import CONFIGS, PICTURES, SHAPES, Array, save, show, show_signed
 
 from ddrecon.io.volumes.table import read_field, write_field
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 CONFIG, CLOUD, PICTURE = CONFIGS / "fig08.yaml", SHAPES / "cloud.npz", PICTURES / "fig08.png"
 PATHS = 8192

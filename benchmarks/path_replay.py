@@ -47,6 +47,8 @@ class Replay:
     @staticmethod
     def of(scene: Scene, views: int = 1) -> Replay:
         """That of the first `views` of `scene`, on as many threads as torch has."""
+        if not os.environ.get("DRJIT_LIBLLVM_PATH"):
+            raise SystemExit("path replay needs an LLVM: set DRJIT_LIBLLVM_PATH")
         module = load_mitsuba(torch.get_num_threads())
         described = mitsuba_scene(scene, scene.views[:views])
         loaded = module.load_dict(make_mitsuba_objects(module, described))
@@ -60,10 +62,6 @@ class Replay:
         """Puts `density` [z, y, x] into the scene."""
         self.parameters[self.name] = self.module.TensorXf(density.numpy()[..., None])
         self.parameters.update()
-
-    def image(self, seed: int, paths: int) -> np.ndarray:
-        """The image [h, w, 3] by so many `paths` a pixel, float32."""
-        return np.array(self.module.render(self.scene, sensor=0, seed=seed, spp=paths), np.float32)
 
     def gradient(
         self, loss_of: Callable[[Any], Any], seed: int, paths: int, view: int = 0
@@ -82,21 +80,13 @@ class Replay:
         return torch.from_numpy(gradient[..., 0])
 
 
-def why_not() -> str | None:
-    """Why path replay cannot run here, or None."""
-    try:
-        import mitsuba  # noqa: F401
-    except ImportError:
-        return "needs Mitsuba 3: pip install ddrecon[reference]"
-    return None if os.environ.get("DRJIT_LIBLLVM_PATH") else "needs an LLVM: set DRJIT_LIBLLVM_PATH"
-
-
 def replay_shot(replay: Replay, paths: int, seed: int) -> Shot:
     """The image and the gradient of its mean, by so many `paths` a pixel."""
     import drjit
 
     start = perf_counter()
-    image = torch.from_numpy(replay.image(seed, paths))
+    rendered = replay.module.render(replay.scene, sensor=0, seed=seed, spp=paths)
+    image = torch.from_numpy(np.array(rendered, np.float32))
     middle = perf_counter()
     gradient = replay.gradient(lambda image: drjit.mean(image, axis=None), seed, paths)
     return Shot(image, gradient, middle - start, perf_counter() - middle, paths)
@@ -113,8 +103,6 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--paths", type=int, nargs="+", default=[4, 16])
     given = parser.parse_args()
-    if lacking := why_not():
-        raise SystemExit(f"path replay {lacking}")
     scene = plume_scene(64, 512, torch.float32, torch.device("cpu"))
     replay = Replay.of(scene)
     rows = {"ours": [shoot(scene) for _ in range(REPEATS + 1)][1:]}

@@ -37,7 +37,7 @@ BARE = 0.05
 MASKED = "with_the_true_mask"
 RUNS = {MASKED: ["volume.sigma_t={file: mask.npz}"], "from_pictures_alone": []}
 """Overrides of each reconstruction."""
-SCORES, FORMS = ("relative L1 error", "mass", "seconds"), (".3f", "+.1%", ".0f")
+SCORES = {"relative L1 error": ".3f", "mass": "+.1%", "seconds": ".0f"}
 THEIRS = ("0.381", "-7.5%", "1116")
 """Their own score, as they kept it: after 19 iterations."""
 
@@ -174,8 +174,8 @@ def main() -> None:
     for name, keys in RUNS.items():
         found = reconstruct(folder, name, [*as_options(keys), *overrides])
         theirs = THEIRS if name == MASKED else ("", "", "")
-        for what, form, score, ours in zip(SCORES, FORMS, theirs, found, strict=True):
-            print_row(f"{name.replace('_', ' ')}: {what}", score, format(ours, form))
+        for what, score, ours in zip(SCORES, theirs, found, strict=True):
+            print_row(f"{name.replace('_', ' ')}: {what}", score, format(ours, SCORES[what]))
 
 
 if __name__ == "__main__":

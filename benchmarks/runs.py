@@ -62,3 +62,8 @@ def start_plume(device: str | torch.device = "cpu", factor: int = 1) -> Reconstr
 def read_plume() -> Tensor:
     """The true density of `configs/plume.yaml`."""
     return torch.tensor(read_field(ROOT / "data/plume/density.npz", "density").values)
+
+
+def apart(one: Tensor, other: Tensor) -> float:
+    """How far two tensors are apart, relative to the second."""
+    return float((one.cpu() - other.cpu()).norm() / other.norm().clamp(min=1e-300))

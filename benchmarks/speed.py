@@ -21,7 +21,7 @@ from statistics import median
 import numpy as np
 import torch
 from figures import print_header, print_row
-from runs import CONFIGS, read_plume, start_run
+from runs import CONFIGS, apart, read_plume, start_run
 from torch import Tensor
 
 from ddrecon.bench import plume_scene
@@ -140,11 +140,8 @@ def print_engines() -> None:
             for engine in ("torch", "warp")
         )
         pairs = [f"{a:.2f} / {b:.2f}" for a, b in zip(torchs, warps, strict=True)]
-        apart = max(
-            float((a - b).norm() / a.norm())
-            for a, b in zip(last["torch"], last["warp"], strict=True)
-        )
-        print_row(name, *pairs, f"{torchs[2] / warps[2]:.2f}", f"{apart:.1e}")
+        farthest = max(map(apart, last["warp"], last["torch"]))
+        print_row(name, *pairs, f"{torchs[2] / warps[2]:.2f}", f"{farthest:.1e}")
 
 
 STAGES = {"scale": print_scale, "engines": print_engines}

@@ -10,9 +10,8 @@ against its deviation. What FOLDER/uncertainty does not hold of pictures is trac
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,16 +45,13 @@ def read_density(name: str) -> Tensor:
     return torch.from_numpy(read_field(ROOT / f"data/{name}.npz", "density").values).float()
 
 
-def known_cases(references: Path | None) -> dict[str, Callable[[], Known]]:
+def known_cases(references: Path | None) -> Iterator[tuple[str, Known]]:
     """The cases by name; one that is to be traced where there are `references`."""
-    cases = {name: partial(read_shipped, *of) for name, of in SHIPPED.items()}
+    for name, (config, truth) in SHIPPED.items():
+        scene = scene_at_level(load_scene(CONFIGS / f"{config}.yaml"), 2)
+        yield name, (scene, read_density(truth))
     if references is not None:
-        cases["ball"] = partial(trace_ball, references / "uncertainty" / "ball")
-    return cases
-
-
-def read_shipped(config: str, truth: str) -> Known:
-    return scene_at_level(load_scene(CONFIGS / f"{config}.yaml"), 2), read_density(truth)
+        yield "ball", trace_ball(references / "uncertainty" / "ball")
 
 
 def trace_ball(folder: Path) -> Known:
@@ -119,8 +115,8 @@ def main() -> None:
     torch.manual_seed(0)
     heads = ("volume", "cells", "within 1, 2 [%]", "in experiments [%]")
     print_header(*heads, "rank correlation", "over all cells", "mass off [deviations]")
-    for name, case in known_cases(options.references).items():
-        print_row(name, *judge(case(), options.calibrate))
+    for name, known in known_cases(options.references):
+        print_row(name, *judge(known, options.calibrate))
 
 
 if __name__ == "__main__":
