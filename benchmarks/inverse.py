@@ -11,7 +11,7 @@ reports RRMSE, our L2, below 20 % and bias 0.1 % below depth 17, and 60 % and -3
 L1 and L2 are sums over all cells, relative to the truth's; mass is the relative error of the sum.
 Where emission is sought too, it stands second. Held out is what a run says of itself. An iteration
 is what a row of `loss.csv` is; of the film they are its last frame's. Scenes stay in FOLDER, and
-are taken from there the next time.
+are taken from there the next time; before, MiB are those of what makes them, where that is more.
 """
 
 from __future__ import annotations
