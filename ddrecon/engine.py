@@ -67,7 +67,7 @@ def _resolve(name: str, asked: str) -> str:
     if find_spec("warp") is not None:
         return _place_kernels(name, asked)
     if name == "warp":
-        raise MissingExtraError(f"{asked} {advice('warp')}")
+        raise MissingExtraError(asked, advice("warp"))
     missing = 'engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast'
     logging.getLogger(LOG).info(missing)
     return "torch"

@@ -71,10 +71,8 @@ class FormatError(DdreconError):
         super().__init__("\n".join(self.lines))
 
 
-class MissingExtraError(DdreconError):
-    """An optional package that a command cannot do without, and that is not installed."""
-
-    exit_code = 3
+class MissingExtraError(FormatError):
+    """An optional package that is not installed, and that `path`, a file or what is asked, needs."""
 
 
 class SolveError(DdreconError):

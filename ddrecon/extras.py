@@ -3,7 +3,7 @@
 from importlib import import_module
 from types import ModuleType
 
-from ddrecon.errors import FormatError, MissingExtraError
+from ddrecon.errors import MissingExtraError
 
 EXTRAS = {
     "OpenImageIO": "exr",
@@ -23,17 +23,9 @@ def advice(package: str) -> str:
     return f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
 
 
-def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package` for a `purpose`; raises MissingExtraError without it."""
+def load_extra(package: str, purpose: object) -> ModuleType:
+    """The module `package` for a `purpose`, or a file; raises MissingExtraError without it."""
     try:
         return import_module(package)
     except ImportError as error:
-        raise MissingExtraError(f"{purpose} {advice(package)}") from error
-
-
-def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package` for the file at `path`; raises FormatError without it."""
-    try:
-        return import_module(package)
-    except ImportError as error:
-        raise FormatError(path, advice(package)) from error
+        raise MissingExtraError(purpose, advice(package)) from error

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, rotation
+from ddrecon.cameras import Camera, twist
 from ddrecon.defaults import choose_diffusion, choose_exchanges, find_occupied
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
@@ -191,20 +191,15 @@ def upright_axis(scene: Scene) -> int:
     return int(upward.sum(0).abs().argmax())
 
 
-def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
-    """`camera` turned by `angle` [rad] about the `axis` (0, 1, 2: x, y, z) through `center`."""
-    middle = camera.pose.new_tensor(center)
-    turn = rotation(angle * torch.eye(3, dtype=torch.float64)[axis]).to(camera.pose)
-    origin = middle + turn @ (camera.pose[:, 3] - middle)
-    return replace(camera, pose=torch.cat([turn @ camera.pose[:, :3], origin[:, None]], 1))
-
-
 def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
     """`count` >= 1 views, from `view` in equal steps once around the volume of `scene`.
 
     They are called `ring_000`, which is that of `view`, `ring_001` and so on.
     """
     axis, center = upright_axis(scene), scene.volume.grid.center_xyz
-    angles = (2 * math.pi * number / count for number in range(count))
-    cameras = (turn_camera(view.camera, axis, angle, center) for angle in angles)
-    return [View(f"ring_{number:03d}", camera) for number, camera in enumerate(cameras)]
+    # What points up, in the camera's own axes, and no shift.
+    upward = torch.cat([view.camera.pose[axis, :3], view.camera.pose.new_zeros(3)])
+    return [
+        View(f"ring_{i:03d}", twist(view.camera, 2 * math.pi * i / count * upward, center))
+        for i in range(count)
+    ]

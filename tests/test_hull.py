@@ -11,7 +11,7 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.hull import bounds_text, doubt_box
 from ddrecon.picture import render
-from ddrecon.scene import View, place_turntable, turn_camera, upright_axis
+from ddrecon.scene import View, place_turntable, upright_axis
 
 BOX = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.8, 0.5]])
 SMOKE = torch.tensor([[0.1, 0.1, 0.12], [0.4, 0.6, 0.4]])
@@ -52,10 +52,12 @@ def looking(origin, up):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_turn_is_rigid_about_the_line_through_the_center(axis):
-    camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 0.7
-    moved = turn_camera(camera, axis, angle, CENTER)
+    camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 2 * math.pi / 9
+    scene = make_scene(random_values(4, 5, 6))
+    scene.up = axis
+    moved = place_turntable(scene, View("view", camera), 9)[1].camera
     change = moved.pose[:, :3] @ camera.pose[:, :3].T
-    middle = torch.tensor(CENTER, dtype=torch.float64)
+    middle = torch.tensor(scene.volume.grid.center_xyz, dtype=torch.float64)
     along = torch.eye(3, dtype=torch.float64)[axis]
     assert torch.allclose(change @ change.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
     assert torch.allclose(change @ along, along, atol=1e-14)
@@ -81,8 +83,7 @@ def test_a_ring_begins_at_its_view_and_goes_once_around():
     views = place_turntable(scene, scene.views[0], 8)
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
     assert torch.allclose(views[0].camera.pose, scene.views[0].camera.pose, atol=1e-15)
-    center, axis = scene.volume.grid.center_xyz, upright_axis(scene)
-    again = turn_camera(views[7].camera, axis, math.pi / 4, center).pose
+    again = place_turntable(scene, views[7], 8)[1].camera.pose
     assert torch.allclose(again, views[0].camera.pose, atol=1e-14)
 
 

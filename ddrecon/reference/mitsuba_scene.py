@@ -25,7 +25,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import rotate_directions
-from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.medium.phase import HenyeyGreenstein, Mixture, PhaseFunction, Rayleigh
 from ddrecon.scene import Scene, View
 
@@ -110,7 +110,7 @@ def sensor_id(index: int) -> str:
 
 def is_gray(volume: Volume) -> bool:
     """Whether red, green and blue are extinguished alike, everywhere."""
-    sigma_t = _fields(volume.sigma_a) + _fields(volume.sigma_s)
+    sigma_t = for_cells(volume.sigma_a) + for_cells(volume.sigma_s)
     return bool((sigma_t - sigma_t.mean(0)).abs().max() <= GRAY * sigma_t.max())
 
 
@@ -125,7 +125,7 @@ def _medium(volume: Volume) -> dict[str, Any]:
     )
     if volume.support is not None:
         density = density * volume.support.cpu()
-    volume = Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
+    volume = Volume(volume.grid, density, for_cells(sigma_a), for_cells(sigma_s), volume.phase)
     sigma_t = volume.sigma_a + volume.sigma_s
     if is_gray(volume):
         sigma_t = sigma_t.mean(0, keepdim=True)
@@ -140,10 +140,6 @@ def _medium(volume: Volume) -> dict[str, Any]:
         "albedo": _albedo(volume),
         "phase": _phase(volume.phase, volume.grid),
     }
-
-
-def _fields(sigma: Tensor) -> Tensor:
-    return sigma if sigma.ndim == 4 else sigma.view(-1, 1, 1, 1)
 
 
 def _albedo(volume: Volume) -> Any:

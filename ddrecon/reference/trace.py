@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from types import ModuleType
@@ -24,7 +25,6 @@ from ddrecon.io.images.table import write_picture, write_preview
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
-from ddrecon.medium.phase import Blend, PhaseFunction, TwoLobe
 from ddrecon.picture import view_image
 from ddrecon.progress import show_progress
 from ddrecon.reference.mitsuba_scene import LONGEST, is_gray, mitsuba_scene, sensor_id
@@ -156,7 +156,7 @@ def pick_color(scene: Scene, color: int) -> Scene:
         volume,
         sigma_a=_pick(volume.sigma_a, color),
         sigma_s=_pick(volume.sigma_s, color),
-        phase=_pick_phase(volume.phase, color),
+        phase=volume.phase.map(partial(_pick_number, color=color)),
     )
     lights = []
     for light in scene.lights:
@@ -169,20 +169,12 @@ def pick_color(scene: Scene, color: int) -> Scene:
     return replace(scene, volume=volume, lights=lights, ground=ground)
 
 
-def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
-    if phase.colors == 1:
-        return phase
-    if isinstance(phase, Blend):
-        first, second = (_pick_phase(lobe, color) for lobe in phase.parts)
-        return replace(phase, first=first, second=second, weight=_pick_number(phase.weight, color))
-    shared = "g" if isinstance(phase, TwoLobe) else ""
-    names = [field.name for field in fields(phase) if field.name != shared]
-    return replace(phase, **{name: _pick_number(getattr(phase, name), color) for name in names})
-
-
 def _pick_number(number: Tensor, color: int) -> Tensor:
-    """The entry of `color` in a `number` [3] or [3, z, y, x]; other numbers as they are."""
-    return number if number.ndim in (0, 3) else _pick(number, color)
+    """The entry of `color` in a `number` [3, ...] of a phase function; others, and cells, as they
+    are.
+    """
+    is_colored = number.shape[:1] == (3,) and number.ndim != 3
+    return _pick(number, color) if is_colored else number
 
 
 def _pick(value: Tensor, color: int) -> Tensor:

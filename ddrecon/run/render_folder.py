@@ -13,7 +13,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.extras import advice, load_for_file
+from ddrecon.extras import advice, load_extra
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
 from ddrecon.io.images.table import (
@@ -108,7 +108,7 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
     if fault is not None:
         raise UsageError(f"--movie {path}: {fault}")
     if path.suffix.lower() == ".mp4":
-        load_for_file("imageio_ffmpeg", path)
+        load_extra("imageio_ffmpeg", path)
 
 
 def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: Choice) -> Outcome:

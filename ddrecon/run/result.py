@@ -57,10 +57,6 @@ def describe_result(
         if (value := getattr(scene.diffusion, key)) is not None:
             described["diffusion"][key] = value
     described["render"]["steps_per_voxel"] = scene.render.steps
-    # The volume, in its box: a reconstructed pair of cross sections replaces either pair.
-    low, high = scene.volume.grid.bounds_xyz
-    described["volume"]["bounds"] = {"min": list(low), "max": list(high)}
-    described["volume"]["resolution"] = list(reversed(scene.volume.grid.shape))
     # The cameras: poses in place of twists.
     for view, section in zip(scene.views, described["views"], strict=True):
         height, width = view.camera.size

@@ -123,7 +123,7 @@ def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides():
 @pytest.mark.parametrize("has_mitsuba", [False, True])
 def test_a_scene_is_measured_by_every_variant(run, monkeypatch, has_mitsuba):
     def refuse(*_, **__):
-        raise MissingExtraError("no Mitsuba here")
+        raise MissingExtraError("Mitsuba", "is not here")
 
     if has_mitsuba:
         pytest.importorskip("mitsuba", reason="Mitsuba 3 is not installed (extra `reference`)")
@@ -131,7 +131,7 @@ def test_a_scene_is_measured_by_every_variant(run, monkeypatch, has_mitsuba):
     else:
         monkeypatch.setattr("ddrecon.reference.trace.open_tracer", refuse)
     result = run("bench", "scene.yaml", "--quick", "-q", "-o", "out", "--json", "report.json")
-    warning = "" if has_mitsuba else "without path tracing: no Mitsuba here\n"
+    warning = "" if has_mitsuba else "without path tracing: Mitsuba: is not here\n"
     assert (result.exit_code, result.stderr) == (0, warning)
     report = json.loads(Path("report.json").read_text())
     assert report == json.loads(Path("out/bench.json").read_text())

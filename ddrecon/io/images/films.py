@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ddrecon.errors import FormatError
-from ddrecon.extras import load_for_file
+from ddrecon.extras import load_extra
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,7 +72,7 @@ def write_film(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
     height, width = frames[0].shape[:2]
     to_yuv = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-crf", "16"]
     tags = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
-    write = load_for_file("imageio_ffmpeg", path).write_frames
+    write = load_extra("imageio_ffmpeg", path).write_frames
     with replace_file(path) as temporary:
         stream = write(
             temporary,
@@ -96,7 +96,7 @@ def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | N
 
     from ddrecon.io.files.reading import check_size
 
-    read = load_for_file("imageio_ffmpeg", path).read_frames
+    read = load_extra("imageio_ffmpeg", path).read_frames
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it tells of turned films
     options = ["-f", FILMS[path.suffix.lower()], "-xerror", "-ss", f"{start:.6f}"]
     end = f":end={high - start:.6f}" if high < math.inf else ""
@@ -127,7 +127,7 @@ def frame_times(path: Path) -> tuple[float, ...]:
 @lru_cache(maxsize=256)
 def _frame_times(path: Path, *_: int) -> tuple[float, ...]:
     """Times of all frames [s], from the film's packets, without decoding."""
-    program = load_for_file("imageio_ffmpeg", path).get_ffmpeg_exe()
+    program = load_extra("imageio_ffmpeg", path).get_ffmpeg_exe()
     film = [program, "-nostdin", "-f", FILMS[path.suffix.lower()], "-i", str(path), *STREAM]
     process = subprocess.run([*film, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
     listed = process.stdout.decode(errors="replace")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.extras import load_for_file
+from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import as_float32, check_size
 from ddrecon.io.images.color import (
@@ -117,7 +117,7 @@ def write_exr(path: Path, pixels: np.ndarray, names: Sequence[str] = "RGB") -> N
 
     Raises FormatError without OpenImageIO.
     """
-    module = load_for_file(PACKAGE, path)
+    module = load_extra(PACKAGE, path)
     spec = module.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
     spec.channelnames = tuple(names)
     spec.attribute("compression", "zip")
@@ -135,7 +135,7 @@ def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     An EXR is opened at the part that is a picture. Raises FormatError unless the file is of this
     `kind`, and small enough.
     """
-    module = load_for_file(PACKAGE, path)
+    module = load_extra(PACKAGE, path)
     settings = module.ImageSpec()
     # Alpha is multiplied into colors that are linear.
     settings.attribute("oiio:UnassociatedAlpha", int(kind == "PNG"))

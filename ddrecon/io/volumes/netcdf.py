@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.extras import load_for_file
+from ddrecon.extras import load_extra
 from ddrecon.io.files.reading import check_size
 from ddrecon.io.volumes.field import METERS, Field, check_field, size_of
 
@@ -48,7 +48,7 @@ class _Side(NamedTuple):
 
 def netcdf_names(path: Path) -> list[str]:
     """The variables of the file at `path` that have axes x, y and z; there must be some."""
-    with load_for_file("netCDF4", path).Dataset(path) as file:
+    with load_extra("netCDF4", path).Dataset(path) as file:
         axes = {name: _axes(variable, seen) for name, variable, seen in _variables(file)}
         names = [name for name in axes if set("xyz") <= set(axes[name].values())]
         if not names:
@@ -91,7 +91,7 @@ def read_netcdf(path: Path, name: str) -> Field:
 
     Raises FormatError when it is damaged, unevenly spaced or not a legal field.
     """
-    with load_for_file("netCDF4", path).Dataset(path) as file:
+    with load_extra("netCDF4", path).Dataset(path) as file:
         variable, coordinates = next(entry[1:] for entry in _variables(file) if entry[0] == name)
         values, axes = _numbers(path, variable), dict[str, str]()
         sizes = dict(zip(variable.dimensions, values.shape, strict=True))

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.extras import load_for_file
+from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import write_bytes
 from ddrecon.io.files.reading import as_float32, check_size
 from ddrecon.io.volumes.field import VECTORS, Facts, Field, Fields, check_field, prune
@@ -312,7 +312,7 @@ class Grid:
             data = stream.read(abs(packed))
             # No more is unpacked than there should be, of a bomb.
             if packed > 0 and self.flags & BLOSC:
-                blosc = load_for_file("blosc", stream.path)
+                blosc = load_extra("blosc", stream.path)
                 is_whole = struct.unpack_from("<I", data, 4) == (size,)
                 data = blosc.decompress(data) if is_whole else b""
             elif packed > 0:
