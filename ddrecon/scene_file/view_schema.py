@@ -21,7 +21,7 @@ Paths = Path | tuple[Path, ...]
 
 FRAME = re.compile(r"\{frame(:0?[1-9]?d)?\}")
 """Where the number of a frame stands in the name of a picture: `{frame:04d}`."""
-TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
+TAKEN = re.compile(r".*\.(reduced|single|multiple|transmittance|depth|slices|gradient|[0-9]{6,})")
 """Names that output files of other views have: their components, and previews by iteration."""
 
 

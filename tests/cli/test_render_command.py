@@ -60,6 +60,16 @@ def test_what_a_render_writes_and_says(succeed):
     assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
 
 
+def test_no_view_is_named_as_the_files_of_another_one(refuse, succeed):
+    """Whatever a render writes beside NAME.exr: NAME.depth is not for a view of its own."""
+    succeed(*RENDER, "--components", "--gradient", "density", "--view", "front")
+    names = {Path(name).stem for name in contents(Path("out"))} - {"front", "render", "ddrecon"}
+    assert {"front.depth", "front.gradient.single"} <= names
+    for name in names:
+        (line,) = refuse(2, "check", "scene.yaml", "-D", f"views.1.name={name}")
+        assert name in line
+
+
 def test_layers_of_the_exr_put_an_image_over_another(succeed):
     """Image + transmittance times what is behind is the image of a view before it."""
     module = pytest.importorskip("OpenImageIO")
