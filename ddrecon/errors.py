@@ -72,7 +72,7 @@ class FormatError(DdreconError):
 
 
 class MissingExtraError(FormatError):
-    """An optional package that is not installed, and that `path`, a file or what is asked, needs."""
+    """An optional package that is not installed; `path` is the file, or the purpose, it is for."""
 
 
 class SolveError(DdreconError):

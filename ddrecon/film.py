@@ -34,7 +34,7 @@ from ddrecon.errors import (
 from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import note_written, write_json
 from ddrecon.io.files.folders import FILM, RUN, Folder, claim_folder
-from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.files.reading import read_json
 from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import read_field, turn_up, write_fields
@@ -77,7 +77,7 @@ from ddrecon.run.run_folder import (
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.build_views import Maker, at_frame, remove_pictures, require_frames
-from ddrecon.scene_file.build_volume import build_media
+from ddrecon.scene_file.build_volume import build_media, cells_of
 from ddrecon.scene_file.load import (
     SceneFile,
     describe,
@@ -191,8 +191,7 @@ class Film:
             fields = fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
             # Colors are averaged.
-            values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
-            sums.append(torch.stack(values).sum(0))
+            sums.append(torch.stack([fields[name].mean(0) for name in moving]).sum(0))
         motion = find_flow(*sums) / (number - before) * self._cell
         for frame in (number, before):
             # Where another rank is writing, it writes this as well.
@@ -424,22 +423,16 @@ def finished_frames(path: Path, frame_range: str | None) -> list[Path]:
 
 
 def fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
-    """Those of the variables `names` that are fields [..., z, y, x], as the run in `folder` has."""
+    """Those of the variables `names` that are fields [C, z, y, x], as the run in `folder` has."""
     files = {name: volume_file(folder, name) for name in names}
-    read = {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
-    values = {name: torch.from_numpy(field.values) for name, field in read.items()}
-    return {n: v if v.ndim == 3 else v.permute(3, 0, 1, 2).contiguous() for n, v in values.items()}
+    return {n: cells_of(read_field(f, field_key(n))) for n, f in files.items() if f.is_file()}
 
 
 def read_shared(path: Path) -> dict[str, Any]:
     """What `path`, a `shared.json`, says. Raises UsageError and FormatError."""
     if not path.is_file():
         raise UsageError(f"--shared {path}: there is no such file; a film's folder has one")
-    with guard_reading(path):
-        try:
-            content = json.loads(path.read_bytes())
-        except (ValueError, RecursionError) as error:
-            raise FormatError(path, f"not JSON: {error}") from error
+    content = read_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("values"), dict):
         raise FormatError(path, "has no 'values'; expected the shared.json of a film")
     values = content["values"]

@@ -64,12 +64,8 @@ UPRIGHT = 0.7
 UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
 
 
-def needed_terms(scene: Scene) -> list[str]:
+def needed_terms(scene: Scene) -> Iterator[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    return [*_find_terms(scene)]
-
-
-def _find_terms(scene: Scene) -> Iterator[str]:
     volume, medium = scene.volume, scale_medium(scene.volume, scene.diffusion.angles)
     is_diffuse = multiply_scatters(medium, scene.diffusion)
     yield _color_term(scene)

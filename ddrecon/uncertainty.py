@@ -45,7 +45,7 @@ RATIO = 1.55
 """The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
 lack what no reconstruction shows (docs/uncertainty.md)."""
 EMPTY = 0.02
-"""Cells of less than this part of the largest are empty."""
+"""Cells of less than this part of the largest are empty, unless all are."""
 WIDTH = 3
 """Cells a side over which errors are averaged."""
 RECORD = "uncertainty.json"
@@ -274,7 +274,7 @@ class Field:
         self.value = experiments.values[name].cpu().double()
         self.errors = [errors[name].cpu().double() for errors in experiments.errors]
         self.squares = [mean_around(error.square(), WIDTH) for error in self.errors]
-        self.is_smoke = self.value.abs() > EMPTY * self.value.abs().max()
+        self.is_smoke = self.value.abs() >= EMPTY * self.value.abs().max()
         self.deviation = self.deviation_by(self.squares)
 
     def deviation_by(self, squares: Sequence[Tensor]) -> Tensor:
@@ -287,15 +287,14 @@ class Field:
 
         Deviations there are by the other experiments; of a single one nothing is known.
         """
-        smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
         ratios = [
-            (error.abs() / self.deviation_by(others))[smoke]
+            (error.abs() / self.deviation_by(others))[self.is_smoke]
             for at, error in enumerate(self.errors)
             if (others := self.squares[:at] + self.squares[at + 1 :])
         ]
         return {
-            "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
-            "deviation": float(self.deviation[smoke].square().mean()) ** 0.5,
+            "root_mean_square": float(self.value[self.is_smoke].square().mean()) ** 0.5,
+            "deviation": float(self.deviation[self.is_smoke].square().mean()) ** 0.5,
             **{
                 f"within_{k}": float((torch.cat(ratios) < k).double().mean()) if ratios else None
                 for k in (1, 2)

@@ -15,6 +15,7 @@ from ddrecon.cameras import (
     distort,
     image_places,
     look_at,
+    pixel_width,
     project,
     ray_through,
     subpixel_offsets,
@@ -86,6 +87,18 @@ def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective):
             for name, error in (("direction", 1e-15), ("origin", 1e-14)):
                 one, other = (getattr(rays, name)[index] for rays in (small, large))
                 torch.testing.assert_close(one, other, rtol=0, atol=error)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_a_pixel_is_as_wide_as_the_way_to_the_next_one(is_perspective):
+    """Also far away, where parallel rays are no farther apart."""
+    seen = camera(is_perspective=is_perspective)
+    right, _, backward, origin = seen.pose.unbind(1)
+    for distance in (0.5, 3.0, 40.0):
+        point = origin - distance * backward
+        beside = point + pixel_width(seen, point) * right
+        (before, after), _ = project(seen, torch.stack([point, beside]))
+        torch.testing.assert_close(after - before, torch.tensor([1.0, 0.0]).double())
 
 
 @given(st.integers(1, 64))

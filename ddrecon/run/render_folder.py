@@ -144,7 +144,7 @@ def render_to_folder(scene: Scene, views: Sequence[View], folder: Path, choice: 
     record: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
         "solves": [{**asdict(r), "residual": float(r.residual)} for r in memory.records],
-        "physics": needed_terms(scene),
+        "physics": [*needed_terms(scene)],
         "files": files,
         "preview": PREVIEW,
         "psnr": quality,
@@ -234,12 +234,14 @@ def _write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) ->
 
     Its exposure is that of all previews from now on: the brightest view is just white.
     """
-    images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
-    white = max(map(find_white, images))
-    exposed = [image / white for image in images]
-    MOVIES[path.suffix.lower()](path, [encode_bytes(image) for image in exposed], fps)
-    for view, image in zip(views, exposed, strict=True):
-        write_preview(folder / f"{view.name}.png", image)
+    # One after another, and twice: all of them as floats may take more memory than there is.
+    stems, frames = [folder / view.name for view in views], list[np.ndarray]()
+    white = max(find_white(read_image(Path(f"{stem}.npy")).pixels) for stem in stems)
+    for stem in stems:
+        exposed = read_image(Path(f"{stem}.npy")).pixels / white
+        frames.append(encode_bytes(exposed))
+        write_preview(Path(f"{stem}.png"), exposed)
+    MOVIES[path.suffix.lower()](path, frames, fps)
     return white
 
 

@@ -80,7 +80,7 @@ def write_run_report(
         plots={"heading": "Loss", "drawn": curves(rows, steps), "text": finer if steps else ""},
         views=_describe_views(findings),
         numbers=table if numbers else None,
-        physics=needed_terms(scene),
+        physics=[*needed_terms(scene)],
         settings=path.with_name("scene.yaml").read_text(encoding="utf-8"),
         environment=[(name, " ".join(map(str, values))) for name, values in versions],
     )

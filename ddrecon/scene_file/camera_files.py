@@ -12,7 +12,6 @@ Source: https://colmap.github.io/format.html
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
-from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.files.reading import guard_reading, read_json
 from ddrecon.scene_file.read import Node, path_in, read_as
 from ddrecon.scene_file.view_schema import (
     FisheyeSection,
@@ -119,10 +118,7 @@ def read_transforms(
             if path.stat().st_size > MAX_BYTES:
                 most = f"{MAX_BYTES // 2**20} MiB"
                 raise FormatError(path, f"is larger than {most}; it holds more than cameras")
-            try:
-                document = node_of("", str(path), json.loads(path.read_bytes()))
-            except (ValueError, RecursionError) as error:
-                raise FormatError(path, f"not JSON: {error}") from error
+            document = node_of("", str(path), read_json(path))
         with in_file(path):
             return _file_views(document, path, test_every)
 

@@ -6,12 +6,13 @@ whatever a decoder stumbles on becomes one line.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from ddrecon.errors import DdreconError, FormatError, is_utf8
 
@@ -51,6 +52,15 @@ def require_stored(path: Path) -> None:
     kind = stat.S_IFMT(os.stat(path).st_mode)
     if kind not in (stat.S_IFREG, stat.S_IFDIR):
         raise FormatError(path, "is a pipe, a device or a socket; only regular files are read")
+
+
+def read_json(path: Path) -> Any:
+    """What the JSON file at `path` says; raises FormatError."""
+    with guard_reading(path):
+        try:
+            return json.loads(path.read_bytes())
+        except (ValueError, RecursionError) as error:
+            raise FormatError(path, f"not JSON: {error}") from error
 
 
 def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
