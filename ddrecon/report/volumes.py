@@ -47,14 +47,6 @@ class Shown:
     frame: int | None = None
 
 
-def find_white_value(values: Tensor) -> float:
-    """The size of the values of a field that are shown as white, or in full color where signed.
-
-    All but one cell in a thousand are below.
-    """
-    return find_high(values.detach().abs().float().cpu().numpy())
-
-
 def describe_world(grid: Grid, scene: Scene | None) -> dict[str, Any]:
     """What stands around a volume on `grid`, for the scripts: which axis is up, light and cameras.
 
@@ -99,13 +91,14 @@ def describe_volume(
 ) -> dict[str, Any]:
     """The section of a page with the `fields` to turn and to cut, and `lines` about them.
 
-    Fields of one name have one scale. `world` is what `describe_world` says; `shown` is the name of
+    Fields of one name have one scale, on which all but one value in a thousand are below white, or
+    full color where they are signed. `world` is what `describe_world` says; `shown` is the name of
     the field that is shown at first. Where no scripts run, there are pictures of the results, of
     the last frame.
     """
     whites = dict[str, float]()
     for field in fields:
-        white = find_white_value(field.values)
+        white = find_high(field.values.detach().abs().float().cpu().numpy())
         whites[field.name] = max(whites.get(field.name, 0.0), white)
     most = min(MOST_CELLS, MOST_OF_PAGE // max(1, len(fields)))
     last = [f for f in fields if f.of == "result" and f.frame == fields[-1].frame]

@@ -30,18 +30,10 @@ from ddrecon.medium.coefficients import Volume, mix_media
 from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
 from ddrecon.scene import Scene, View, require_above, require_supported
+from ddrecon.scene_file import schema
 from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
-from ddrecon.scene_file.schema import (
-    AmbientSection,
-    BeamSection,
-    DirectionalSection,
-    EnvironmentSection,
-    GroundSection,
-    LightSection,
-    PointSection,
-)
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
@@ -52,10 +44,10 @@ from ddrecon.variables.values import (
 )
 
 LIGHTS: dict[type, Callable[..., Light]] = {
-    DirectionalSection: DirectionalLight,
-    AmbientSection: AmbientLight,
-    PointSection: PointLight,
-    BeamSection: BeamLight,
+    schema.DirectionalSection: DirectionalLight,
+    schema.AmbientSection: AmbientLight,
+    schema.PointSection: PointLight,
+    schema.BeamSection: BeamLight,
 }
 """What each section of a light becomes; keys have the same names in both."""
 START_OF_EMISSION = 0.1
@@ -160,9 +152,9 @@ def _build_parts(
     return media, views, lights, ground
 
 
-def _build_light(maker: Maker, owner: str, section: LightSection) -> Light:
+def _build_light(maker: Maker, owner: str, section: schema.LightSection) -> Light:
     """The light of `section`, whose variables begin with `owner`."""
-    if not isinstance(section, EnvironmentSection):
+    if not isinstance(section, schema.EnvironmentSection):
         numbers = {
             key: maker.color(owner + key, value) if key in BRIGHTNESS else maker.tensor(value)
             for key, value in vars(section).items()
@@ -181,7 +173,7 @@ def _map_of(maker: Maker, name: str, pixels: np.ndarray) -> Tensor:
     return maker.picture(pixels)
 
 
-def _build_ground(maker: Maker, section: GroundSection) -> Ground:
+def _build_ground(maker: Maker, section: schema.GroundSection) -> Ground:
     name, albedo = "ground.albedo", section.albedo
     if isinstance(albedo, FieldFile):
         pixels = read_referenced(maker.scene_file, f"{name}.file", albedo.file, _read_albedo)

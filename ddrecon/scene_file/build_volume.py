@@ -27,21 +27,9 @@ from ddrecon.medium.phase import (
     TwoLobe,
 )
 from ddrecon.numerics.series import at_even_angles
+from ddrecon.scene_file import schema
 from ddrecon.scene_file.build_views import Maker
 from ddrecon.scene_file.load import SceneFile, read_referenced
-from ddrecon.scene_file.schema import (
-    Bounds,
-    ByHeight,
-    ByLabel,
-    HenyeyGreensteinSection,
-    MediumSection,
-    MieSection,
-    RayleighSection,
-    TableSection,
-    TwoLobeSection,
-    VolumeSection,
-    Water,
-)
 from ddrecon.settings import FieldFile
 from ddrecon.variables.kinds import FIELDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
@@ -83,7 +71,7 @@ class _Medium:
     `fields` are those that do, with the key at which the scene names them.
     """
 
-    def __init__(self, maker: Maker, prefix: str, section: MediumSection):
+    def __init__(self, maker: Maker, prefix: str, section: schema.MediumSection):
         self.maker, self.prefix, self.section = maker, prefix, section
         self.fields: dict[str, tuple[str, Field]] = {}
         self.quantities: dict[str, tuple[str, Any]] = {
@@ -92,11 +80,11 @@ class _Medium:
             if hasattr(section, name)
         }
         match phase := section.phase:
-            case HenyeyGreensteinSection():
+            case schema.HenyeyGreensteinSection():
                 self.quantities["g"] = "phase.g", phase.g
-            case TwoLobeSection():
+            case schema.TwoLobeSection():
                 self.quantities["phase.weight"] = "phase.weight", phase.weight
-            case MieSection():
+            case schema.MieSection():
                 by_cell = getattr(section, RADIUS, None)
                 radius = phase.effective_radius if by_cell is None else by_cell
                 self.quantities[RADIUS] = RADIUS, radius
@@ -107,7 +95,7 @@ class _Medium:
 
     def read_fields(self) -> None:
         """Reads the quantities that files give cell by cell; raises SceneError or FormatError."""
-        kinds = FieldFile | ByLabel
+        kinds = FieldFile | schema.ByLabel
         files = [name for name, (_, value) in self.quantities.items() if isinstance(value, kinds)]
         self.fields |= dict(zip(files, gather(self.read_field, files), strict=True))
 
@@ -115,21 +103,21 @@ class _Medium:
         """The key at which the scene names the file of `variable`, and its content."""
         water, (name, value) = self.section.sigma_t, self.quantities[variable]
         key = f"volume.{self.prefix}{name}"
-        if isinstance(value, ByLabel):
+        if isinstance(value, schema.ByLabel):
             read = partial(read_field, name=value.name)
             labels = read_referenced(self.maker.scene_file, f"{key}.labels", value.labels, read)
             return f"{key}.labels", self.look_up(variable, f"{name}.table", value, labels)
         called = value.name or variable.removeprefix(PHASE)
-        is_free = variable == "density" and not isinstance(water, Water)
+        is_free = variable == "density" and not isinstance(water, schema.Water)
         unit = None if is_free else UNITS.get(variable)
         read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
         field = read_referenced(self.maker.scene_file, f"{key}.file", value.file, read)
-        if isinstance(water, Water) and field.meters not in (None, water.meters):
+        if isinstance(water, schema.Water) and field.meters not in (None, water.meters):
             fault = f"but u of {value.file.name} has {field.meters:g} m"
             raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
         return f"{key}.file", field
 
-    def look_up(self, variable: str, key: str, by_label: ByLabel, field: Field) -> Field:
+    def look_up(self, variable: str, key: str, by_label: schema.ByLabel, field: Field) -> Field:
         """`variable` in each cell by the table at `key`, of which `field` has the labels."""
         table = self.table_of(variable, key, by_label.table)
         labels = field.values.astype(np.int64)
@@ -156,7 +144,7 @@ class _Medium:
         axis = "zyx".index(self.maker.tree.volume.up)
         centers = grid.lower[axis] + grid.spacing[axis] * (np.arange(grid.shape[axis]) + 0.5)
         for variable, (name, value) in self.quantities.items():
-            if isinstance(value, ByHeight):
+            if isinstance(value, schema.ByHeight):
                 key = f"{name}.values"
                 table = self.table_of(variable, key, value.values)
                 colors = [
@@ -172,7 +160,7 @@ class _Medium:
         if name in self.fields:
             return cells_of(self.fields[name][1]).double()
         value = self.quantities[name][1]
-        if isinstance(value, Water):
+        if isinstance(value, schema.Water):
             radius = self.values(RADIUS)
             return torch.where(radius > 0, EXTINCTION * value.meters / radius, 0.0)
         value = self.maker.tree.share_color(self.prefix + name, value)
@@ -192,7 +180,7 @@ class _Medium:
         density = tensor(self.values("density"))[0].expand(grid.shape)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
         medium.index = getattr(section, "index", 1.0)
-        if isinstance(section, VolumeSection) and self.maker.tree.glows:
+        if isinstance(section, schema.VolumeSection) and self.maker.tree.glows:
             if section.temperature is not None:
                 medium.black_body = tensor(black_body_radiance(self.values("temperature")[0]))
             else:
@@ -204,13 +192,13 @@ class _Medium:
     def build_phase(self) -> PhaseFunction:
         """The phase function; MissingExtraError for droplets without miepython."""
         match section := self.section.phase:
-            case None | HenyeyGreensteinSection():
+            case None | schema.HenyeyGreensteinSection():
                 return HenyeyGreenstein(self.number("g"))
-            case TwoLobeSection():
+            case schema.TwoLobeSection():
                 return TwoLobe(self.maker.tensor(section.g), self.number("phase.weight"))
-            case TableSection():
+            case schema.TableSection():
                 return Tabulated(self.maker.tensor(self.read_table(section)))
-            case RayleighSection():
+            case schema.RayleighSection():
                 return Rayleigh(self.maker.tensor(0.0))
         radius = self.values(RADIUS).squeeze(0)
         known = radius[radius > 0]
@@ -234,7 +222,7 @@ class _Medium:
         value = self.quantities[name][1]
         return self.maker.tensor(self.maker.tree.share_color(self.prefix + name, value))
 
-    def read_table(self, section: TableSection) -> Tensor:
+    def read_table(self, section: schema.TableSection) -> Tensor:
         """Values at even angles, [C, steps + 1]."""
         key = f"volume.{self.prefix}phase.file"
         table = read_referenced(self.maker.scene_file, key, section.file, read_phase_table)
@@ -252,7 +240,7 @@ def _kind_name(variable: str) -> str:
     return variable if variable in FIELDS else "density"
 
 
-def _scatter(section: MieSection, radius: float) -> np.ndarray:
+def _scatter(section: schema.MieSection, radius: float) -> np.ndarray:
     """Values at even angles of droplets of this effective radius, [C, steps + 1]."""
     colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
     sizes = radius, section.effective_variance
@@ -301,7 +289,7 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
     """
     section, problems = scene_file.tree.volume, Problems()
     box, size = None, section.resolution if isinstance(section.resolution, tuple) else None
-    if isinstance(section.bounds, Bounds):
+    if isinstance(section.bounds, schema.Bounds):
         box = np.array([section.bounds.min, section.bounds.max])
     sizes = {"volume.resolution": size} | {key: field.resolution for key, field in fields.items()}
     boxes = {"volume.bounds": box} | {key: field.bounds for key, field in fields.items()}

@@ -22,7 +22,7 @@ from ddrecon.cameras import twist
 from ddrecon.errors import UsageError, nearest
 from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
-from ddrecon.medium.coefficients import Volume, remix
+from ddrecon.medium.coefficients import Volume, for_cells, remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.records import faults_of
 from ddrecon.scene import Scene, View
@@ -254,11 +254,8 @@ def extinction_of(volume: Volume) -> Tensor:
 
 def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Both as [C, z, y, x] if either is; a constant then has one cell."""
-    axes = max(first.ndim, second.ndim)
-    first, second = (
-        value if value.ndim == axes else value.view(-1, 1, 1, 1) for value in (first, second)
-    )
-    return first, second
+    is_even = first.ndim == second.ndim
+    return (first, second) if is_even else (for_cells(first), for_cells(second))
 
 
 def _albedo_of(volume: Volume) -> Tensor:

@@ -23,7 +23,7 @@ from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.errors import UsageError
 from ddrecon.film import MIXED, share_out, spread_out
-from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
+from ddrecon.io.files.folders import LOCK, MANIFEST, Folder, hold
 from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
@@ -381,7 +381,7 @@ def test_a_part_done_anew_leaves_all_else(film, run, succeed, refuse, monkeypatc
     written = {
         f"{place}/{name}".removeprefix("./")
         for place in (".", *places)
-        for name in (MANIFEST, *names_in(Path("out", place)))
+        for name in (MANIFEST, *Folder(Path("out", place), "run").names)
     }
     assert {name for name, data in before.items() if data is not None} <= written
     for place in places:

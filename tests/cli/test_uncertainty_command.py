@@ -11,7 +11,7 @@ from small_scene import contents, write_scene
 from test_optimize_command import press_ctrl_c_in
 
 from ddrecon.cli.commands import main
-from ddrecon.io.files.folders import MANIFEST, names_in
+from ddrecon.io.files.folders import MANIFEST, Folder
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.uncertainty import Uncertainty
 
@@ -69,7 +69,7 @@ def test_it_writes_deviations_numbers_and_a_page(finished, succeed):
 
 def test_no_run_is_harmed(finished, succeed, refuse):
     """Nor is a folder made where there is nothing to go on with; what was written has its names."""
-    assert files_of("run") == set(names_in(finished))
+    assert files_of("run") == set(Folder(finished, "run").names)
     (finished / "frames").mkdir()  # which makes no film of it
     (line,) = refuse(2, "uncertainty", "run", "-o", "sure", "--resume", *KNOWN)
     assert line.startswith("sure/checkpoints/last.pt: there is no checkpoint to resume from")
@@ -80,7 +80,7 @@ def test_no_run_is_harmed(finished, succeed, refuse):
     succeed("render", "run", "-o", "seen", "--ring", "2", "--fluence", "--components", *light)
     succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1", *KNOWN)
     for kind in ("seen", "sure"):
-        assert files_of(kind) == set(names_in(Path(kind)))
+        assert files_of(kind) == set(Folder(Path(kind), kind).names)
     (line,) = refuse(2, "optimize", "scene.yaml", "-o", "sure", "--overwrite")
     assert line.startswith("sure: is the folder of another kind of job, uncertainty")
 

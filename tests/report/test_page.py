@@ -26,13 +26,12 @@ from ddrecon.pictures import encode, encode_bytes
 from ddrecon.reconstruct.frame import Row
 from ddrecon.report import volumes
 from ddrecon.report.page import draw_curve, page_text, write_page
-from ddrecon.report.pictures import slices
+from ddrecon.report.pictures import find_high, slices
 from ddrecon.report.volumes import (
     FARTHEST,
     Shown,
     describe_volume,
     describe_world,
-    find_white_value,
 )
 from ddrecon.run.report import curves
 
@@ -164,7 +163,7 @@ def test_a_field_is_embedded_as_it_is_displayed(colors):
     values.flatten()[7] = 9  # one cell of a thousand, or nearly
     fields = [Shown("albedo", of, v) for of, v in (("result", values / 2), ("truth", values))]
     half, found = embedded(*fields)
-    white = find_white_value(values)
+    white = find_high(values.abs().numpy())
     assert half["white"] == found["white"] == white < 9
     assert (found["name"], found["of"], found["size"]) == ("albedo", "truth", [5, 4, 3])
     cells = values.permute(1, 2, 3, 0) if colors else values[..., None]
@@ -178,7 +177,7 @@ def test_a_large_field_is_embedded_coarser(monkeypatch):
     values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
     (found,) = embedded(Shown("density", "result", values))
     assert found["size"] == [3, 2, 3]
-    expected = 255 * encode(float(values[4:, 2:, 2:4].mean()) / find_white_value(values))
+    expected = 255 * encode(float(values[4:, 2:, 2:4].mean()) / find_high(values.abs().numpy()))
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
 
 

@@ -39,7 +39,7 @@ class Folder:
     """
 
     def __init__(self, path: Path, kind: str):
-        self.path, self.kind, self.names = path, kind, dict.fromkeys(names_in(path))
+        self.path, self.kind, self.names = path, kind, dict.fromkeys(_read_manifest(path)[1])
 
     def note(self, file: Path, mark: str) -> None:
         """Adds `file` to the manifest before it is written; another's file is moved aside."""
@@ -202,19 +202,18 @@ def kind_of_folder(path: Path) -> str | None:
     return _read_manifest(path)[0]
 
 
-def names_in(path: Path) -> list[str]:
-    """The names in the manifest of the folder `path`; none that leads out of it."""
-    return [n for n in _read_manifest(path)[1] if not (n.startswith("/") or ".." in Path(n).parts)]
-
-
 def _read_manifest(path: Path) -> tuple[str | None, list[str]]:
-    """The kind and the names in the manifest of the folder `path`; a last line may be torn."""
+    """The kind and the names in the manifest of the folder `path`, but what leads out of it.
+
+    A last line may be torn.
+    """
     try:
         kind, *names = (path / MANIFEST).read_bytes().decode(**TEXT).split("\n")
     except OSError:
         return None, []
     kind = kind.removeprefix("ddrecon ")
-    return (kind, names[:-1]) if kind in KINDS else (None, [])
+    inner = [n for n in names[:-1] if not (n.startswith("/") or ".." in Path(n).parts)]
+    return (kind, inner) if kind in KINDS else (None, [])
 
 
 def require_free_files(paths: Sequence[Path], *, may_exist: bool) -> None:

@@ -10,7 +10,7 @@ fastest, then x.
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from ddrecon.io.files.atomic import replace_file, write_bytes
 from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
 from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields, check_field
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
-from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
+from ddrecon.io.volumes.vdb import read_grids, read_vdb, write_vdb
 
 BOUNDS = "bounds"
 HEADER = struct.Struct("<3sB5i6f")
@@ -98,13 +98,13 @@ class VolumeFormat(NamedTuple):
 
     write: Callable[[Path, Fields, np.ndarray, Facts], None] | None
     read: Callable[[Path, str], Field]
-    names: Callable[[Path], list[str]] | None = None
+    names: Callable[[Path], Iterable[str]] | None = None
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, read_grids),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
 NANOVDB = ".nvdb"
@@ -128,14 +128,14 @@ def field_names(path: Path) -> list[str]:
     """
     names = _format_of(path).names
     with guard_reading(path):
-        return names(path) if names else [path.stem.rpartition(".")[2]]
+        return list(names(path)) if names else [path.stem.rpartition(".")[2]]
 
 
 def read_field(path: Path, name: str) -> Field:
     """The field `name` (`density`, ...) of the volume at `path`; raises FormatError if unusable."""
     kind = _format_of(path)
     with guard_reading(path):
-        if kind.names and name not in (names := kind.names(path)):
+        if kind.names and name not in (names := list(kind.names(path))):
             names_text = ", ".join(map(repr, names)) or "none"
             advice = f"; say name: {names[0]} beside its path" if len(names) == 1 else ""
             raise FormatError(path, f"has no field {name!r}; it has {names_text}{advice}")

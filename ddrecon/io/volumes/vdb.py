@@ -376,11 +376,6 @@ def read_grids(path: Path) -> dict[str, Grid]:
     return {grid.name: grid for grid in grids}
 
 
-def vdb_names(path: Path) -> list[str]:
-    """The names of the grids of the file at `path`; raises FormatError unless it can be read."""
-    return list(read_grids(path))
-
-
 def read_vdb(path: Path, name: str) -> Field:
     """The grid `name` of the file at `path`, in the box of all grids that have its voxels.
 
