@@ -155,13 +155,11 @@ def run_bench(scene: Scene, double: Scene, tracer: Tracer | None, is_quick: bool
         name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
     }
     exact, solved = dict[str, Shot](), dict[tuple[object, ...], Shot]()
+    marching = replace(double.render, steps_per_voxel=max(3, double.render.steps), tolerance=0.0)
     for name, variant in show_progress([*variants_of(double, is_quick).items()], "exact solutions"):
-        marching = replace(
-            variant.render, steps_per_voxel=max(3, variant.render.steps), tolerance=0.0
-        )
         diffusion = replace(variant.diffusion, tolerance=1e-8, warm_start=False)
         as_exact = replace(variant, render=marching, diffusion=diffusion)
-        key = _settings(replace(as_exact, render=double.render))
+        key = _settings(as_exact)
         if key not in solved:  # alike ones are solved once
             solved[key] = shoot(as_exact)
         exact[name] = solved[key]

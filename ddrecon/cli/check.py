@@ -31,15 +31,6 @@ TOO_WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
-def memory_estimate(scene: Scene) -> int:
-    """Bytes that rendering all views of `scene` takes at its peak, without torch itself.
-
-    Derivatives are counted where the scene is to be optimized.
-    """
-    media = scene.volume.media or {"": scene.volume}
-    return needs_of_scene(media, scene.views, scene.diffusion, scene.optimize).total
-
-
 def supports_of(frames: Iterable[Scene]) -> list[Support]:
     """Where density may be in each of `frames`, of one scene or of a film, by their pictures.
 
@@ -80,6 +71,7 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
         if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
     bounds, cells = list(map(list, grid.bounds_xyz)), list(reversed(grid.shape))
+    media = scene.volume.media or {"": scene.volume}
     lines = [f"grid: {sizes_text(cells)} cells of {box_text(cells, bounds)}"]
     views, texts = _describe_views(scene)
     lines += [f"views: {len(views)}", *texts]
@@ -94,7 +86,7 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
         "loss": loss,
         "support": support,
         "engine": current_engine(),
-        "memory_bytes": memory_estimate(scene),
+        "memory_bytes": needs_of_scene(media, scene.views, scene.diffusion, settings).total,
         "iteration_seconds": seconds,
         "iterations": settings and settings.iterations,
         "doubts": find_doubts(scene),

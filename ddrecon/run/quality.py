@@ -282,22 +282,17 @@ def find_odd(views: Sequence[View], images: Mapping[str, Tensor], gain: float) -
         move, explained = best_shift(view, images[view.name])
         if math.hypot(*move) > SHIFT and explained > max(MOVED, to_come):
             moved[view.name] = math.hypot(*move)
-    brightest = sorted(lit.items(), key=lambda item: -abs(math.log(item[1])))[:MOST_NAMED]
-    farthest = sorted(moved.items(), key=lambda item: -item[1])[:MOST_NAMED]
-    texts = dict[str, str]()
-    if lit:
-        texts["exposure"] = (
-            "exposure? pictures brighter or darker, as a whole, than the others say: "
-            f"{', '.join(f'{name} ({factor:.2f} times)' for name, factor in brightest)}; give all "
-            "one exposure and white balance, or optimize them (views.*.exposure)"
-        )
-    if moved:
-        texts["cameras"] = (
-            "cameras? renders fit better when moved: "
-            f"{', '.join(f'{name} ({pixels:.1f} pixels)' for name, pixels in farthest)}; check "
-            "poses and intrinsics, or optimize the poses (views.NAME.camera)"
-        )
-    return texts
+    brightest = sorted(lit, key=lambda name: -abs(math.log(lit[name])))[:MOST_NAMED]
+    farthest = sorted(moved, key=lambda name: -moved[name])[:MOST_NAMED]
+    texts = {
+        "exposure": "exposure? pictures brighter or darker, as a whole, than the others say: "
+        f"{', '.join(f'{name} ({lit[name]:.2f} times)' for name in brightest)}; give all one "
+        "exposure and white balance, or optimize them (views.*.exposure)",
+        "cameras": "cameras? renders fit better when moved: "
+        f"{', '.join(f'{name} ({moved[name]:.1f} pixels)' for name in farthest)}; check poses and "
+        "intrinsics, or optimize the poses (views.NAME.camera)",
+    }
+    return {kind: texts[kind] for kind, odd in (("exposure", lit), ("cameras", moved)) if odd}
 
 
 def find_unfinished(gain: float, iteration: int) -> str | None:

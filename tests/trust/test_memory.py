@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from ddrecon import memory
-from ddrecon.cli.check import memory_estimate
 from ddrecon.memory import Needs, explain_shortage, usable_cores
 from ddrecon.run import render_folder
 from ddrecon.scene_file.build import load_scene
@@ -158,7 +157,8 @@ def test_a_shortage_is_one_line_that_says_what_would_fit(run, monkeypatch, short
     begin, _, fits = result.stderr.partition("this would fit: ")
     assert begin == f"out of memory: {amount} is not free; " and result.stderr.count("\n") == 1
     assert "--dtype float32" in fits and "volume.resolution: [" in fits
-    half = memory_estimate(load_scene("scene.yaml", dtype=torch.float64)) // 2
+    load_scene("scene.yaml", dtype=torch.float64)
+    half = memory._latest[0].total // 2
     monkeypatch.setattr(memory, "free_memory", lambda _: half)
     require_fit(run, result.stderr.partition(", or images")[0], "check", "scene.yaml")
 
