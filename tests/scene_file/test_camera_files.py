@@ -313,6 +313,13 @@ def test_a_lens_that_folds_over_is_refused(read, tmp_path, numbers):
     assert len(caught.value.problems) == 1
 
 
+@pytest.mark.parametrize("text", ["{}", "[]", "3"])
+def test_a_file_without_frames_is_refused(refusal, tmp_path, text):
+    (tmp_path / "t.json").write_text(text)
+    (line,) = refusal(changed(views={"transforms": "t.json"}), kind=FormatError)
+    assert line.startswith("t.json: has no 'frames'")
+
+
 # COLMAP: rays as its manual has them, text and binary alike, and refusals in one line.
 
 CAMERAS: dict[str, list[float]] = {
@@ -396,19 +403,19 @@ POINTS = "1.5 2.5 -1 3.5 4.5 12"
 @pytest.mark.parametrize(
     "lines",
     [
-        ["a.png", "b 2.png", "b 10.png"],
-        ["b 10.png", "", "a.png", "b 2.png"],
-        ["b 2.png", POINTS, "b 10.png", "a.png"],
-        ["", "", "a.png", "", "  ", "# c", "b 10.png", POINTS, "", "b 2.png"],
+        ["a.png", "b b 2.png", "b b 10.png"],
+        ["b b 10.png", "", "a.png", "b b 2.png"],
+        ["b b 2.png", POINTS, "b b 10.png", "a.png"],
+        ["", "", "a.png", "", "  ", "# c", "b b 10.png", POINTS, "", "b b 2.png"],
     ],
 )
 def test_lines_of_points_may_be_missing(read, tmp_path, lines):
-    """No image is taken for points; pictures are in order of their numbers."""
+    """No image is taken for points, of as many words as these; pictures are in order of numbers."""
     write_text(tmp_path / "sparse/0", "PINHOLE")
     text = [f"{IMAGE} {line}" if line.endswith("png") else line for line in lines]
     (tmp_path / "sparse/0/images.txt").write_text("\n".join(text))
     found = [(view.name, view.split) for view in read(scene_text(test_every=2)).tree.views]
-    assert found == [("a", "test"), ("b_2", "train"), ("b_10", "test")]
+    assert found == [("a", "test"), ("b_b_2", "train"), ("b_b_10", "test")]
 
 
 def test_models_of_windows_are_read(read, tmp_path):
@@ -466,6 +473,13 @@ def test_a_damaged_text_is_refused(read, tmp_path, file, old, new, problem):
     with pytest.raises((FormatError, SceneError)) as caught:
         read(scene_text())
     assert problem in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_model_without_images_is_refused(read, tmp_path):
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    (tmp_path / "sparse/0/images.txt").write_text("# images\n")
+    with pytest.raises(FormatError, match="has no images"):
+        read(scene_text())
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
