@@ -107,7 +107,8 @@ def build_views(maker: Maker, grid: Grid | None) -> list[View]:
 def remove_pictures(scene_file: SceneFile, size: tuple[int, int] | None) -> SceneFile:
     """`scene_file` with views that have no pictures, of this `size` (width, height) where given.
 
-    Raises SceneError where the size of one is not known without.
+    What their cameras do to radiance stays. Raises SceneError where the size of one is not known
+    without.
     """
     views = list[ViewSection]()
     for index, view in enumerate(scene_file.tree.views):
@@ -116,7 +117,8 @@ def remove_pictures(scene_file: SceneFile, size: tuple[int, int] | None) -> Scen
             fault = "has no resolution but that of its picture; give one by --size W H"
             raise scene_file.refused(f"views.{index}.camera", fault)
         camera = replace(camera, resolution=size or camera.resolution)
-        views.append(ViewSection(name=view.name, camera=camera, split=view.split))
+        backdrop = None if isinstance(view.background, Path) else view.background
+        views.append(replace(view, camera=camera, image=None, mask=None, background=backdrop))
     marks = {} if size is None else {"views": f"--size {size[0]} {size[1]}"}
     tree = replace(scene_file.tree, views=tuple(views))
     return replace(scene_file, tree=tree, marks={**scene_file.marks, **marks})

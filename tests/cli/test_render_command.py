@@ -173,6 +173,16 @@ def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed):
     np.testing.assert_allclose(named, pixels("front"), rtol=1e-4)
 
 
+def test_a_size_keeps_what_a_camera_does_to_radiance(succeed):
+    """Its own size changes nothing; a background that is a picture is of another size."""
+    changes = ["exposure=[1.5, 1, 0.8]", "offset=0.01", "background=0.2", "weight=2"]
+    changed = [word for change in changes for word in ("-D", f"views.0.{change}")]
+    succeed(*RENDER, *changed)
+    before = pixels("front")
+    succeed(*RENDER, *changed, "--size", "8", "6", "--overwrite")
+    np.testing.assert_array_equal(pixels("front"), before)
+
+
 def test_a_size_keeps_the_width_of_view(succeed):
     """The mean of twice as many pixels is near the picture of few, and a taller one goes on."""
     succeed(*RENDER, "--view", "front", "--size", "80", "60")
