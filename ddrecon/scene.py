@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, twist
 from ddrecon.defaults import choose_diffusion, choose_exchanges, find_occupied
-from ddrecon.errors import UsageError
+from ddrecon.errors import UsageError, suggestion
 from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import BeamLight, Light, PointLight
@@ -105,12 +105,11 @@ class Scene:
         self.reason = reason or self.reason
 
     def view(self, name: str) -> View:
-        """The view called `name`; raises UsageError with the known names."""
+        """The view called `name`; raises UsageError with the nearest name, or all known ones."""
         for view in self.views:
             if view.name == name:
                 return view
-        names = ", ".join(view.name for view in self.views)
-        raise UsageError(f"no view {name!r}; the views are {names}")
+        raise UsageError(f"no view {name!r}{suggestion(name, [view.name for view in self.views])}")
 
 
 def require_supported(scene: Scene) -> None:

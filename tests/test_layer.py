@@ -305,7 +305,7 @@ def test_no_part_of_a_scene_is_guessed(place, value):
 
 def test_one_precision_and_a_known_view():
     scene = small_layer().scene
-    with pytest.raises(UsageError, match="no view 'side'; the views are view"):
+    with pytest.raises(UsageError, match="no view 'side'; known: view"):
         render(scene, "side")
     scene.volume.sigma_a = scene.volume.sigma_a.float()
     with pytest.raises(UsageError, match=r"sigma_a: is torch\.float32 on cpu, but"):

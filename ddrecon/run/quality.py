@@ -191,7 +191,8 @@ def register(
 def shift_between(camera: Camera, other_camera: Camera, volume: Volume) -> float:
     """By how many pixels, in the mean, what is in `volume` moves in the image of `other_camera`.
 
-    Cells count by their extinction, all alike where there is none.
+    Cells count by their extinction, all alike where there is none. It is the image's diagonal where
+    there is no cell that both cameras look at.
     """
     weight = (extinction_of(volume).amax(0) * volume.density).flatten()
     weight = weight if bool(weight.any()) else torch.ones_like(weight)
@@ -202,7 +203,8 @@ def shift_between(camera: Camera, other_camera: Camera, volume: Volume) -> float
     )
     shift = (place - moved).norm(dim=1).to(weight)
     weight = weight[weight > 0] * shift.isfinite()
-    return float((weight * shift).nansum() / weight.sum())
+    is_seen = bool(weight.any())
+    return float((weight * shift).nansum() / weight.sum()) if is_seen else math.hypot(*camera.size)
 
 
 def diagnose(

@@ -234,6 +234,8 @@ def _violations(
         beyond = [x for x in numbers if isinstance(x, float) and not kind.low <= x <= kind.high]
         if beyond:
             yield key, f"must be {kind.limits}, found {beyond[0]:g}"
+    if kind.is_direction and settings.init == (0, 0, 0):
+        yield "init", "must not be zero"
     for key in ("field", "tv"):
         if getattr(settings, key) and not kind.is_cellwise:
             yield key, "it is not a field, so it has none"

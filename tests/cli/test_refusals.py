@@ -26,7 +26,8 @@ render scene.yaml -o full => 2 full: holds notes.txt, which ddrecon did not writ
 optimize scene.yaml -o . --overwrite => 2 scene.yaml: was changed and would be replaced; name a c
 render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
-render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
+render scene.yaml -o out --view back => 2 no view 'back'; known: front, side
+render scene.yaml -o out --view frnt => 2 no view 'frnt'; did you mean 'front'?
 render scene.yaml -o out --gradient densty => 2 --gradient densty: no variable 'densty'; did you m
 render scene.yaml -o out --gradient foo => 2 --gradient foo: no variable 'foo'; besides views, the
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range 2<=x

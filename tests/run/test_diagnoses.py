@@ -271,6 +271,12 @@ def test_a_shift_is_that_of_the_smoke_and_of_no_empty_cell():
         assert found == pytest.approx((0.5 * one + 1.5 * other) / 2)
 
 
+def test_a_camera_that_has_lost_the_smoke_was_moved_across_its_picture():
+    camera, scene = make_camera(size=(30, 40)), plain_scene(torch.ones(4, 4, 4).double())
+    away = replace(camera, pose=camera.pose * camera.pose.new_tensor([-1, 1, -1, 1]))
+    assert shift_between(camera, away, scene.volume) == 50
+
+
 @pytest.mark.parametrize(
     ("gain", "much"), [(0.7, "half"), (0.2, "some 20 %"), (0.05, ""), (math.inf, "")]
 )

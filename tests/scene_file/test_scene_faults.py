@@ -115,6 +115,7 @@ optimize.parameters.sigma_a={{init: {{file: cells.npz}}, field: false}} => diffe
 optimize.parameters={{albedo: {{}}, sigma_s: {{}}}} => albedo: cannot be optimized beside sigma_s
 optimize.parameters.lights.7.irradiance={{}} => did you mean 'lights.0.irradiance'?
 optimize.parameters.lights.0.direction={{init: 3}} => direction.init: expected a list of 3 numbers
+optimize.parameters.lights.0.direction={{init: [0, 0, 0]}} => direction.init: must not be zero
 optimize.parameters.lights.0.irradiance={{init: {{file: cells.npz}}}} => irradiance is not a field
 optimize.parameters.views.back.camera={{}} => did you mean 'views.front.camera'?
 volume.g => -D volume.g: expected key.path=value
