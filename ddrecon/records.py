@@ -113,8 +113,6 @@ def find_excess(number: float, limits: Mapping[str, Any]) -> str:
 def _is_of(value: Any, kind: Any) -> bool:
     """Whether `value` is of the type `kind`, whatever is in it."""
     origin, arguments = get_origin(kind) or kind, get_args(kind)
-    if origin is Any:
-        return True
     if origin is Literal:
         return value in arguments
     if origin in (tuple, list):
