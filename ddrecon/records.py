@@ -29,8 +29,8 @@ type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 class Limits(TypedDict, total=False):
     """Limits of each number of a field; `minimum` and `maximum` are legal, the others are not.
 
-    Of a vector that `is_nonzero` one entry is not 0. The manual has `expert` fields on a page of
-    their own: no scene needs these.
+    Of a vector that `is_nonzero` one entry is not 0. The manual has `expert` fields in a table at
+    its end: no scene needs these.
     """
 
     minimum: float

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import FINER
-from ddrecon.grid import Grid
 from ddrecon.light.ground import stay_above
 from ddrecon.light.lights import (
     BRIGHTNESS,
@@ -156,7 +155,8 @@ def _round_terms(medium: Medium, scene: Scene) -> Iterator[str]:
     if settings.times > 1:
         finer = scene.volume.grid.refine(settings.times, settings.refine_along)
         along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
-        yield f"light in {_cells(finer)}, {settings.times} times as narrow{along}"
+        cells = " x ".join(map(str, reversed(finer.shape)))
+        yield f"light in {cells} cells, {settings.times} times as narrow{along}"
     if (settings.receive or 1) > 1:
         yield f"light of suns in {settings.receive}^3 parts of each cell"
     if scene.reason:
@@ -199,10 +199,6 @@ def thick_terms(scene: Scene) -> Iterator[str]:
         f"light in cells of at most {depth:.2g} optical depths: in thirds of the thickest it "
         f"changes by {mean:+.1%} in the mean, {spread:.1%} RMS (docs/accuracy.md#thick-cells)"
     )
-
-
-def _cells(grid: Grid) -> str:
-    return f"{' x '.join(map(str, reversed(grid.shape)))} cells"
 
 
 def _listed(numbers: Tensor, is_by_cell: bool) -> str:

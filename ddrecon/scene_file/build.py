@@ -251,7 +251,7 @@ def _varied(
         return 0
     value = read[last]()
     is_field = value.ndim >= 3 or isinstance(settings.init, FieldFile)
-    is_field = is_field or (last == "emission" and _is_dark(value))
+    is_field = is_field or (last == "emission" and not bool(value.any()))
     is_field = is_field if settings.field is None else settings.field
     return is_field * (colors if kind.is_color else 1)
 
@@ -263,7 +263,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     except UsageError as error:
         raise scene_file.refused(key, str(error)) from None
     kind, init, is_field = kind_of(name), settings.init, settings.field
-    if name == "emission" and _is_dark(value):
+    if name == "emission" and not bool(value.any()):
         # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.
         value = torch.full_like(value, START_OF_EMISSION * unit_of(scene, name))
         is_field = is_field is not False
@@ -293,10 +293,6 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     if not kind.allows(value):
         raise scene_file.refused(f"{key}.init", f"must be {kind.limits} everywhere")
     return value
-
-
-def _is_dark(emission: Tensor) -> bool:
-    return not bool(emission.any())
 
 
 def _fill(
