@@ -126,6 +126,8 @@ def _is_of(value: Any, kind: Any) -> bool:
 
 def _describe(kind: Any) -> str:
     """What a value of the type `kind` is, in words."""
+    if get_origin(kind) is Literal:
+        return " or ".join(map(repr, get_args(kind)))
     if get_origin(kind) is tuple:
         return f"{'' if Ellipsis in get_args(kind) else len(get_args(kind))} numbers".strip()
     name = getattr(get_origin(kind) or kind, "__name__", str(kind))

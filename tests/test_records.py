@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -28,6 +28,7 @@ class Tree:
     steps: tuple[float, ...] = bounded((0.1,), below=1)
     kind: str | None = one_of(None, ("a", "b"))
     is_on: bool = True
+    end: int | Literal["auto"] = "auto"
     leaves: list[Leaf] = field(default_factory=list)
     named: Mapping[str, Leaf] = field(default_factory=dict)
 
@@ -46,6 +47,8 @@ WRONG: list[tuple[dict[str, Any], str, str]] = [
     ({"count": 1.5}, "count", "expected a whole number, found 1.5"),
     ({"count": True}, "count", "expected a whole number, found True"),
     ({"size": (1, 2, 3)}, "size", "expected 2 numbers, found (1, 2, 3)"),
+    ({"size": "ab"}, "size", "expected 2 numbers, found 'ab'"),
+    ({"end": "never"}, "end", "expected a whole number or 'auto', found 'never'"),
     ({"size": (0, 2)}, "size.0", "must be at least 1, found 0"),
     ({"steps": (0.1, math.nan)}, "steps.1", "must be finite, found nan"),
     ({"kind": "c"}, "kind", "expected one of a, b, found 'c'"),
