@@ -167,19 +167,20 @@ class Rays:
         return z / distance, y / distance, x / distance
 
 
-def pixel_width(camera: Camera, place: Tensor) -> float:
-    """How wide [u] a pixel of `camera` is at `place` (x, y, z)."""
+def pixel_width(camera: Camera, place: Tensor, least: float) -> float:
+    """How wide [u] a pixel of `camera` is at `place` (x, y, z), or at `least` so far [u] away."""
     width = 2 * float(camera.half_width) / camera.size[1]
     distance = float(camera.pose[:, 3].cpu().dist(place.to(camera.pose.dtype)))
-    return width * distance if camera.is_perspective else width
+    return width * max(distance, least) if camera.is_perspective else width
 
 
 def cell_width(grid: Grid, camera: Camera) -> float:
     """How many pixels of `camera` a cell in the middle of `grid` is wide, along its shortest side.
 
-    A width of `CELL` fits pictures best.
+    A width of `CELL` fits pictures best. A camera within the box sees cells as from a face of it.
     """
-    return min(grid.spacing) / pixel_width(camera, torch.tensor(grid.center_xyz))
+    nearest = min(grid.extent) / 2
+    return min(grid.spacing) / pixel_width(camera, torch.tensor(grid.center_xyz), nearest)
 
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:

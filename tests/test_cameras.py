@@ -7,11 +7,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from media import make_camera
+from media import make_camera, make_scene, random_values
 
 from ddrecon.cameras import (
     Camera,
     cast_rays,
+    cell_width,
     distort,
     image_places,
     look_at,
@@ -21,6 +22,9 @@ from ddrecon.cameras import (
     subpixel_offsets,
     twist,
 )
+from ddrecon.grid import Grid
+from ddrecon.scene import View
+from ddrecon.variables.kinds import pose_change
 
 ORIGIN, TARGET, UP = (
     torch.tensor(v, dtype=torch.float64)
@@ -89,6 +93,16 @@ def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective):
                 torch.testing.assert_close(one, other, rtol=0, atol=error)
 
 
+def test_a_camera_in_the_middle_sees_cells_as_from_a_face():
+    grid = Grid((4, 4, 4), (0.0, 0.0, 0.0), (2.0, 3.0, 4.0))
+    scene = make_scene(random_values(4, 4, 4), grid=grid)
+    middle, face = (make_camera((*grid.center_xyz[:2], z)) for z in (1.0, 2.0))
+    assert cell_width(grid, middle) == pytest.approx(cell_width(grid, face))
+    scene.views = [View("in", middle), View("on", face)]
+    changes = [pose_change(scene, f"views.{v.name}.camera", v.camera.pose) for v in scene.views]
+    torch.testing.assert_close(*changes)
+
+
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_a_pixel_is_as_wide_as_the_way_to_the_next_one(is_perspective):
     """Also far away, where parallel rays are no farther apart."""
@@ -96,7 +110,7 @@ def test_a_pixel_is_as_wide_as_the_way_to_the_next_one(is_perspective):
     right, _, backward, origin = seen.pose.unbind(1)
     for distance in (0.5, 3.0, 40.0):
         point = origin - distance * backward
-        beside = point + pixel_width(seen, point) * right
+        beside = point + pixel_width(seen, point, 0.0) * right
         (before, after), _ = project(seen, torch.stack([point, beside]))
         torch.testing.assert_close(after - before, torch.tensor([1.0, 0.0]).double())
 

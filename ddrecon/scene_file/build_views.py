@@ -359,7 +359,8 @@ def fit_volume(scene_file: SceneFile) -> SceneFile:
     middle, sides = corners.mean(0), corners[1] - corners[0]
     if isinstance(resolution, str):
         views = build_views(Maker(each_frame(scene_file)[0]), None)
-        cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
+        nearest = float(sides.min()) / 2
+        cell = CELL * mean(pixel_width(view.camera, middle, nearest) for view in views)
         count = math.prod(math.ceil(side / cell) for side in sides.tolist())
         if count > MANY_CELLS:
             wider = (count / MANY_CELLS) ** (1 / 3)

@@ -57,11 +57,13 @@ def brightness_change(scene: Scene, name: str, start: Tensor) -> float:
 def pose_change(scene: Scene, name: str, start: Tensor) -> Tensor:
     """What moves the image by `PIXELS` where the volume is: three turns [rad], three shifts [u].
 
-    A turn about the box's center moves its corners, a shift along the axis makes it larger.
+    A turn about the box's center moves its corners, a shift along the axis makes it larger. A
+    camera within the box counts as one at a face.
     """
     camera, grid = _view_of(scene, name).camera, scene.volume.grid
     radius = math.hypot(*grid.extent) / 2
     distance = float(camera.pose[:, 3].dist(camera.pose.new_tensor(grid.center_xyz)))
+    distance = max(distance, _side(scene) / 2)
     pixel = 2 * float(camera.half_width) / camera.size[1]
     pixel, depth = (pixel * distance, distance / radius) if camera.is_perspective else (pixel, 1.0)
     turn = pixel / radius

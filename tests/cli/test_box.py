@@ -64,7 +64,9 @@ def test_a_box_holds_what_is_seen_and_little_more(scene, lens):
     path = scene(lens)
     found = read_scene(path)
     volume, views = found.tree.volume, load_scene(path).views
-    pixel = float(np.mean([pixel_width(view.camera, torch.tensor(CENTERS[0])) for view in views]))
+    pixel = float(
+        np.mean([pixel_width(view.camera, torch.tensor(CENTERS[0]), 0.0) for view in views])
+    )
     for axis in range(3):
         low, high = (end([c[axis] for c in CENTERS]) for end in (min, max))
         # Two pixels on each side are asked for, and the ball seen through a cell is in all of it.
