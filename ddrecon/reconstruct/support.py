@@ -63,7 +63,7 @@ class Support:
             share, view = min(zip(shares, (view.name for view in self.views), strict=True))
             raise SceneError(
                 f"{KEY}: no cell is left: of each that is seen, some training view shows nothing"
-                f" (view {view!r} alone leaves {100 * share:.2g} %); check the cameras and masks,"
+                f" (view {view!r} alone leaves {100 * share:.3g} %); check the cameras and masks,"
                 " or raise support_margin"
             )
         return hull
@@ -134,7 +134,7 @@ def find_cut(support: Support, grid: Grid) -> str | None:
             ]
     if not cut:
         return None
-    names = ", ".join(f"{name} ({100 * share:.2g} % of its light)" for name, share in cut.items())
+    names = ", ".join(f"{name} ({100 * share:.3g} % of its light)" for name, share in cut.items())
     blamed = "the cameras"
     if max(by) > 0:
         blamed = f"camera {support.views[by.index(max(by))].name}, which alone shows nothing there"
@@ -159,7 +159,7 @@ def support_text(support: dict[str, Any]) -> str:
     if "box" in support:
         described += f"; what they show fits in {bounds_text(torch.tensor(support['box']))}"
     if support["lonely"] > LONELY:
-        share = f"{100 * support['lonely']:.2g} %"
+        share = f"{100 * support['lonely']:.3g} %"
         described += f"; fewer than two views see {share} of the cells, which can hold ghosts"
     return described
 

@@ -196,7 +196,7 @@ def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
         verdict = "what diffusion alone lacks; a second round tells what is left"
     else:
         verdict = "not at rest; more may help (diffusion.transport_rounds)"
-    changed = f"{100 * residual:.2g} %"
+    changed = f"{100 * residual:.3g} %"
     return f"transport rounds: {count}, the last changed light by {changed}: {verdict}"
 
 

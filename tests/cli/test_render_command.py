@@ -129,12 +129,13 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed, said, made):
         (3, 0.011, None, "not at rest"),
         (1, 0.09, 0.1, "at rest"),
         (2, 2e-6, 1e-6, "not at rest"),
+        (1, 0.998, None, "what diffusion alone lacks"),  # 99.8 %, not 1e+02 %
     ],
 )
 def test_it_is_said_whether_light_has_come_to_rest(count, residual, tolerance, verdict):
     words = rounds_text(count, residual, tolerance)
-    begin = f"transport rounds: {count}, the last changed light by {100 * residual:.2g} %: "
-    assert words.startswith(begin + verdict)
+    begin = f"transport rounds: {count}, the last changed light by {100 * residual:.3g} %: "
+    assert words.startswith(begin + verdict) and "e+" not in words
 
 
 def test_a_balance_is_printed_and_a_record(succeed):
