@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import platform
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.io.files.atomic import write_json
+from ddrecon.io.files.atomic import json_text, write_json
 from ddrecon.io.files.folders import Folder, claim_folder
 from ddrecon.progress import be_quiet
 from ddrecon.ranks import is_first, join_ranks, rank_count
@@ -155,7 +154,7 @@ class Session:
         prints_json = self.report == STDOUT
         if self.output != NOWHERE:
             lines = [*lines, f"written to {self.output}, {monotonic() - self.begun:.1f} s in all"]
-        click.echo(json.dumps(report, indent=1) if prints_json else "\n".join(lines))
+        click.echo(json_text(report) if prints_json else "\n".join(lines))
         if self.report is not None and not prints_json:
             write_json(self.report, report)
 

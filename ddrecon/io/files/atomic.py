@@ -75,9 +75,15 @@ def write_bytes(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def json_text(content: Any) -> str:
+    """`content` as JSON, indented; a number that is not finite is null, as JSON has no such."""
+    plain = json.loads(json.dumps(content), parse_constant=lambda _: None)
+    return json.dumps(plain, indent=1)
+
+
 def write_json(path: Path, content: Any) -> None:
-    """Writes `content` to `path` as JSON, indented."""
-    write_bytes(path, f"{json.dumps(content, indent=1)}\n".encode())
+    """Writes `json_text` of `content` to `path`."""
+    write_bytes(path, f"{json_text(content)}\n".encode())
 
 
 def is_temporary(path: Path) -> bool:

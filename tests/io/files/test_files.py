@@ -1,6 +1,8 @@
 """Files are written whole or not at all; a folder is one process's, and knows what it wrote."""
 
 import errno
+import json
+import math
 import os
 import subprocess
 import sys
@@ -270,3 +272,11 @@ def test_where_nothing_was_written_no_folder_is_left(tmp_path):
         write_json(tmp_path / "a/b/kept", 0)
         raise ZeroDivisionError
     assert kind_of_folder(tmp_path / "a/b") == RUN
+
+
+def test_json_is_read_by_whoever_keeps_to_its_rules(tmp_path):
+    """Numbers that are not finite, which Python alone would read, are null."""
+    content = {"worst": [math.inf, -math.inf, math.nan, 1e300], "name": "NaN"}
+    write_json(tmp_path / "a.json", content)
+    read = json.loads((tmp_path / "a.json").read_text(), parse_constant=pytest.fail)
+    assert read == {"worst": [None, None, None, 1e300], "name": "NaN"}
