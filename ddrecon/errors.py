@@ -35,10 +35,6 @@ class DdreconError(Exception):
 
     exit_code = 2
 
-    def advise(self, advice: str) -> None:
-        """Has the error end with more `advice`."""
-        self.args = (f"{self}; {advice}",)
-
 
 class _ProblemsError(DdreconError):
     """An error with one line for each of its `problems`."""

@@ -28,7 +28,7 @@ def describe(path: Path) -> dict[str, Any]:
     from ddrecon.io.images.table import read_image  # here, as volumes are read without torch
 
     image = read_image(path)
-    height, width = image.size
+    height, width = image.pixels.shape[:2]
     is_gray = bool((image.pixels == image.pixels[..., :1]).all())
     return {
         "pixels": [width, height],

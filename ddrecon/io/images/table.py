@@ -59,11 +59,6 @@ class Image:
     coverage: np.ndarray | None = None
     step: float = 0.0
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        return self.pixels.shape[0], self.pixels.shape[1]
-
 
 def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
     """The image at `path`, of a film the one of this number after that at `time` [s].

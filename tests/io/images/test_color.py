@@ -137,7 +137,10 @@ def test_turned_pictures_are_taken_as_stored_and_said_once_a_folder(tmp_path, su
         with pytest.warns(DataWarning, match="EXIF orientation 6") as caught:
             image = read_image(path)
         told |= {str(each.message) for each in caught}
-        assert image.size == (16, 32) and image.pixels[2, 2, 0] > 0.9 > image.pixels[12, 28, 0]
+        assert (
+            image.pixels.shape[:2] == (16, 32)
+            and image.pixels[2, 2, 0] > 0.9 > image.pixels[12, 28, 0]
+        )
     assert len(told) == 1 and str(tmp_path / f"*{suffix}") in told.pop()
 
 
