@@ -108,7 +108,8 @@ def _read_stored(path: Path, frame: int, time: float) -> np.ndarray:
 
 
 def _image_of(path: Path, values: np.ndarray, step: float = 0.0) -> Image:
-    """The image of linear `values`, which are to be checked."""
+    """The image of linear `values`, which are to be checked; a last axis of one entry goes."""
+    values = values[..., 0] if values.shape[2:] == (1,) else values
     if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,), (4,)) or not values.size:
         legal = "expected [h, w], [h, w, 3] or [h, w, 4]"
         raise FormatError(path, f"has shape {list(values.shape)}; {legal}")

@@ -73,6 +73,15 @@ def test_arrays_of_other_shapes_are_refused(tmp_path, shape):
         read_image(tmp_path / "a.npy")
 
 
+@pytest.mark.parametrize("read", [read_image, read_mask])
+def test_gray_arrays_may_have_an_axis_of_one_channel(tmp_path, read):
+    """As volumes may, and as OpenCV and others write them."""
+    gray = pixels_of(5, 4, 3, 1).round()
+    np.save(tmp_path / "a.npy", gray)
+    np.save(tmp_path / "b.npy", gray[..., 0])
+    assert np.array_equal(read(tmp_path / "a.npy").pixels, read(tmp_path / "b.npy").pixels)
+
+
 def test_linear_files_keep_dots_in_their_names(tmp_path):
     pytest.importorskip("OpenImageIO")
     pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
