@@ -59,14 +59,14 @@ def choose_diffusion(
     left = float(volume.phase.moments(3)[:, 2].abs().max())
     if any(name.partition(".")[0] in ("g", "phase") for name in optimized):
         left = max(left, OPTIMIZED)
-    reasons = [f"a second moment of {left:.2g} of the phase function"]
+    reasons = [f"a second moment of {left:.3g} of the phase function"]
     depth, is_flat = sum(map(greatest_depth, media)), _is_flat(media)
     if any(name.endswith("density") for name in optimized):
         depth, is_flat = 0.0, False
     thin = FINER_FLAT if is_flat else FINER
     times, along = _choose_cells(settings, volume, media, depth / thin)
     if depth > thin:
-        reasons.append(f"cells of {depth:.2g} optical depths")
+        reasons.append(f"cells of {depth:.3g} optical depths")
     rounds, degree, causes = _choose_rounds(volume, optimized, left, depth / times, is_flat)
     reasons += causes
     if settings.transport_tolerance is not None:

@@ -86,7 +86,7 @@ def needed_terms(scene: Scene) -> Iterator[str]:
         yield "no multiple scattering: no diffusion solve"
     depth = greatest_depth(volume) / scene.diffusion.times
     samples = _count(scene.render.steps, "sample")
-    thickest = f" of at most {depth:.2g} optical depths" if depth > 0 else ""
+    thickest = f" of at most {depth:.3g} optical depths" if depth > 0 else ""
     yield f"view rays: {samples} a cell{thickest}"
 
 
@@ -196,7 +196,7 @@ def thick_terms(scene: Scene) -> Iterator[str]:
     mean = float((weight * finer).sum() / (weight * light).sum()) - 1
     spread = float((weight * (finer - light) ** 2).sum() / (weight * light**2).sum()) ** 0.5
     yield (
-        f"light in cells of at most {depth:.2g} optical depths: in thirds of the thickest it "
+        f"light in cells of at most {depth:.3g} optical depths: in thirds of the thickest it "
         f"changes by {mean:+.1%} in the mean, {spread:.1%} RMS (docs/accuracy.md#thick-cells)"
     )
 

@@ -1,5 +1,6 @@
 """What `ddrecon check` tells of a scene."""
 
+import math
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -92,7 +93,7 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
         "doubts": find_doubts(scene),
     }
     least, most = min(widths), max(widths)
-    lines.append(f"cells: {least:.2g} to {most:.2g} pixels wide{_advise_on_cells(least)}")
+    lines.append(f"cells: {least:.3g} to {most:.3g} pixels wide{_advise_on_cells(least)}")
     lines += ["physics:", *(f"  {term}" for term in report["physics"])]
     counts = report["optimizes"].items()
     sought = [f"{name} ({count:,} number{'s' if count > 1 else ''})" for name, count in counts]
@@ -105,8 +106,8 @@ def describe(scene: Scene, supports: Sequence[Support] = ()) -> Outcome:
     if seconds and settings is not None:
         # A run that ends by itself makes about a hundred.
         count = 100 if settings.iterations == AUTO else settings.iterations
-        whole = f"at most {count * seconds / 60:.2g} minutes for {count}"
-        lines.append(f"time: about {seconds:.2g} s an iteration at full resolution, {whole}")
+        whole = f"at most {math.ceil(count * seconds / 60)} minutes for {count}"
+        lines.append(f"time: about {seconds:.3g} s an iteration at full resolution, {whole}")
     return report, lines
 
 

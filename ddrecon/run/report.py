@@ -101,7 +101,7 @@ def list_numbers(
             moved = shift_between(old, new, scene.volume)
             apart = float((new.pose - old.pose)[:, :3].norm())  # sqrt(8) sin(angle / 2)
             turned = math.degrees(2 * math.asin(min(1.0, apart / math.sqrt(8))))
-            text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
+            text = f"moved by {moved:.2f} pixels, turned by {turned:.3g} degrees"
             rows.append((p.name, "as given", text))
         elif not p.is_field and len(value) <= LISTED:
             pairs = list(zip(start.tolist(), value.tolist(), strict=True))
@@ -109,7 +109,7 @@ def list_numbers(
                 cosine = torch.nn.functional.cosine_similarity(start, value, dim=0)
                 turned = math.degrees(math.acos(min(1.0, float(cosine))))
                 text = ", ".join(f"{y:.4g}" for _, y in pairs)
-                text += f" (turned by {turned:.2g} degrees)"
+                text += f" (turned by {turned:.3g} degrees)"
             else:
                 changes = [f" ({y / x - 1:+.1%})" if x else "" for x, y in pairs]
                 ends = zip(pairs, changes, strict=True)

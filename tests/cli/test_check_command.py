@@ -21,7 +21,7 @@ def test_grid_views_physics_memory_and_time(succeed, folder):
     assert {"views: 2", "physics:", "optimizes: density (120 numbers)"} <= set(lines)
     assert {f"{view}, with image" for view in views} <= set(lines)
     assert lines[-2].startswith("memory: about ") and "MiB" in lines[-2]
-    assert lines[-1].startswith("time: about ") and "minutes for 4" in lines[-1]
+    assert lines[-1].startswith("time: about ") and "at most 1 minutes for 4" in lines[-1]
     bare = [f"-D{key}=null" for key in ("optimize", "views.0.image", "views.1.image")]
     lines = succeed("check", "scene.yaml", *bare).stdout.splitlines()
     assert {"optimizes: nothing", *views} <= set(lines) and lines[-1].startswith("memory:")
