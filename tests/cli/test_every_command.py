@@ -146,7 +146,7 @@ def test_an_engine_that_cannot_be_is_refused(refuse, succeed, monkeypatch):
     assert ['pip install "ddrecon[fast]"' in text for text in texts] == [True, False]
     command = "optimize", "scene.yaml", "-o", "out", "--engine"
     (line,) = refuse(3, *command, "warp")
-    assert line.startswith("engine warp needs warp: pip install")
+    assert line.startswith("engine warp: needs warp: pip install")
     assert "'cuda' is not one of" in refuse(2, *command, "cuda")[-1]
     monkeypatch.setattr(engine, "_engine", None)
     monkeypatch.setenv("DDRECON_ENGINE", "cuda")

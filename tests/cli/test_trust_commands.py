@@ -63,7 +63,7 @@ def test_views_are_targets(succeed):
 
 def test_without_mitsuba(refuse, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    told = 'the reference renderer needs mitsuba: pip install "ddrecon[reference]"'
+    told = 'the reference renderer: needs mitsuba: pip install "ddrecon[reference]"'
     assert refuse(3, *REFERENCE) == [told]
 
 
