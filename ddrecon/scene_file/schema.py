@@ -17,19 +17,13 @@ from typing import Any, ClassVar, Literal
 from ddrecon.grid import Triple
 from ddrecon.io.images.films import FILMS
 from ddrecon.records import Violation, bounded, one_of
-from ddrecon.scene_file.view_schema import (
-    FRAME,
-    Color,
-    FramesSection,
-    Pair,
-    ViewSection,
-    ViewSource,
-)
+from ddrecon.scene_file.view_schema import FRAME, Color, FramesSection, ViewSection, ViewSource
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, RenderSettings
 from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
 Count = tuple[int, int, int]
 Auto = Literal["auto"]
+Pair = tuple[float, float]
 AXES = {"choices": ("x", "y", "z"), "may_be_empty": True}
 
 MAX_CELLS = 2**30
