@@ -147,7 +147,7 @@ def test_float_images_come_back(tmp_path, suffix):
     path = tmp_path / f"a{suffix.upper()}"
     WRITERS[suffix](tmp_path / f"a{suffix}", PICTURE)
     image = read_image((tmp_path / f"a{suffix}").rename(path))
-    assert image.pixels.dtype == np.float32 and image.size == (6, 8) and image.coverage is None
+    assert image.pixels.dtype == np.float32 and image.coverage is None
     expected = np.floor(128 + 127 * PICTURE) / 64 if suffix == ".hdr" else PICTURE
     assert np.array_equal(image.pixels, expected)
 
