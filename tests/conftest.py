@@ -70,6 +70,12 @@ def few_directions(monkeypatch):
     monkeypatch.setattr("ddrecon.light.ground.UPWARDS", 4)
 
 
+@pytest.fixture
+def untimed(monkeypatch):
+    """`check` tries no iterations to say how long they take: that is what takes it longest."""
+    monkeypatch.setattr("ddrecon.cli.check.time_iteration", lambda _: 1.0)
+
+
 @pytest.fixture(scope="module")
 def shapes_by_python():
     """For devices of their own, of which C++ knows no shapes of sums with numbers."""

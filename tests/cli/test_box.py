@@ -11,11 +11,14 @@ from ddrecon.cameras import cast_rays, pixel_width
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
+pytestmark = pytest.mark.usefixtures("untimed")
 RADIUS, CENTERS = 0.2, ((0.1, 0.3, -0.2), (0.1, 0.5, -0.2))
+WIDTH, HEIGHT = 54, 42
 SCENE = """\
 frames: {first: 0, last: 1}
 volume: {bounds: auto, resolution: auto, density: 0, sigma_t: 8, albedo: 0.9}
 lights: [{type: directional, direction: [-1, -2, -1], irradiance: 2.5}]
+diffusion: {model: none}
 optimize: {parameters: {density: {init: 0}}}
 views:
 """
@@ -34,7 +37,7 @@ def scene(folder):
     def write(lens="pinhole", behind=0, ball=0.5, more="", radius=RADIUS):
         views = [
             f"  - {{name: v{i}, image: 'v{i}_{{frame}}.npy', {more} camera: {{{LENSES[lens]}, "
-            f"origin: {list(place)}, target: [0, 0.3, 0], resolution: [90, 70]}}}}"
+            f"origin: {list(place)}, target: [0, 0.3, 0], resolution: [{WIDTH}, {HEIGHT}]}}}}"
             for i, place in enumerate(PLACES)
         ]
         path = folder / "auto.yaml"
@@ -42,7 +45,7 @@ def scene(folder):
         generator = np.random.default_rng(1)
         for frame, center in enumerate(CENTERS):
             for i in range(len(PLACES)):
-                np.save(f"v{i}_{frame}.npy", np.zeros((70, 90, 3), np.float32))
+                np.save(f"v{i}_{frame}.npy", np.zeros((HEIGHT, WIDTH, 3), np.float32))
             box = "volume.bounds={min: [-1, -1, -1], max: [1, 1, 1]}"
             sized = load_scene(path, overrides=[box, "volume.resolution=[4, 4, 4]"])
             for i, view in enumerate(sized.views):
@@ -50,8 +53,8 @@ def scene(folder):
                 away = torch.tensor(center[::-1]) - rays.origin
                 along = (away * rays.direction).sum(1, keepdim=True)
                 hits = (away - along * rays.direction).norm(dim=1) < radius
-                picture = torch.where(hits, ball, behind).view(70, 90, 1).expand(-1, -1, 3).numpy()
-                picture = picture + 0.002 * generator.standard_normal(picture.shape)
+                picture = torch.where(hits, ball, behind).numpy().reshape(HEIGHT, WIDTH, 1)
+                picture = picture + 0.002 * generator.standard_normal((HEIGHT, WIDTH, 3))
                 np.save(f"v{i}_{frame}.npy", picture.astype(np.float32))
         return path
 
@@ -104,7 +107,7 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(scene, r
     bright = read_scene(scene()).tree.volume
     dark = scene(behind=0.9, ball=0.4, more="background: 0.9,")
     assert read_scene(dark).tree.volume == bright
-    np.save("empty.npy", np.full((70, 90, 3), 0.9, np.float32))
+    np.save("empty.npy", np.full((HEIGHT, WIDTH, 3), 0.9, np.float32))
     dark = scene(behind=0.9, ball=0.4, more="background: empty.npy,")
     assert read_scene(dark).tree.volume == bright
     told = run("check", "auto.yaml").stdout
@@ -155,7 +158,7 @@ def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(scene, run, ref
 def test_cells_far_wider_than_pixels_and_far_too_many_are_told(scene, run, monkeypatch):
     """With how many pixels a run averages; `auto` takes wider ones."""
     scene()
-    told = run("check", "auto.yaml", "-D", "volume.resolution=[3, 3, 3]").stdout
+    told = run("check", "auto.yaml", "-D", "volume.resolution=[2, 2, 2]").stdout
     (width,) = re.findall("cells: (.*) to", told)
     size = int(float(width) / 2)
     assert f"averages {size} x {size} pixels" in told

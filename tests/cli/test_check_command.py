@@ -56,7 +56,8 @@ PHYSICS = [
 
 @pytest.mark.parametrize(("override", "present", "absent"), PHYSICS)
 def test_only_the_physics_a_scene_needs(succeed, override, present, absent):
-    overrides = ["-D", "diffusion.transport_rounds=null", "-D", override]
+    changes = "diffusion.transport_rounds=null", "optimize=null", "volume.density=0", override
+    overrides = [word for change in changes for word in ("-D", change)]
     result = succeed("check", "scene.yaml", "--json", *overrides)
     physics = "\n".join(json.loads(result.stdout)["physics"])
     assert present in physics and absent not in physics

@@ -44,7 +44,7 @@ views:
 REST = """\
 diffusion: {model: none}
 optimize:
-  iterations: 24
+  iterations: 16
   parameters: {density: {init: 0}, lights.0.irradiance: {}, "views.*.exposure": {}}
 """
 SCATTERED = "diffusion={transport_rounds: 0}"
@@ -91,7 +91,7 @@ def whole(made, tmp_path_factory):
     return str(folder / "whole")
 
 
-FEW = "-D", "optimize.iterations=6"
+FEW = "-D", "optimize.iterations=3"
 ALONE = *FEW, "-D", "frames.calibrate=0"
 
 
@@ -113,7 +113,7 @@ def test_a_film_is_runs_in_a_sequence(whole, film, succeed):
     out = Path(whole)
     record = json.loads((out / "film.json").read_text())
     assert [row["frame"] for row in record["frames"]] == list(range(FRAMES))
-    assert all(1 <= row["iterations"] <= 24 for row in record["frames"])
+    assert all(1 <= row["iterations"] <= 16 for row in record["frames"])
     assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
     # Its page has the volume of each frame beside its pictures.
     page = (out / "report.html").read_text()
@@ -285,9 +285,9 @@ def test_frames_of_films_are_those_of_pictures(film, refuse):
 
 @pytest.mark.slow
 def test_from_python(whole, film):
-    sizes = ["frames.last=1", "frames.calibrate=0", "optimize.iterations=6"]
+    sizes = ["frames.last=1", "frames.calibrate=0", "optimize.iterations=3"]
     found = list(ddrecon.optimize_sequence("film.yaml", overrides=sizes, dtype=torch.float64))
-    assert all(1 <= len(result.rows) <= 6 for result in found)
+    assert all(1 <= len(result.rows) <= 3 for result in found)
     kept = list(ddrecon.optimize_sequence(Path(whole).with_name("film.yaml"), whole))
     for number, result in enumerate(kept):
         there = read_field(Path(f"{whole}/frames/{number:04d}/volumes/density.npz"), "density")
@@ -299,16 +299,17 @@ def test_from_python(whole, film):
 
 def test_a_frame_that_fails_is_named_and_left_to_a_resume(film, run):
     Path("front_01.npy").write_bytes(b"broken")
-    first = run(*optimize("-o", "out", *FEW))
+    few = optimize("-o", "out", "-D", "frames.last=2", *FEW)
+    first = run(*few)
     assert first.exit_code == 3
     warned, told = first.stderr.splitlines()
     assert warned.startswith(f"warning: frame 1, left out: {film}/front_01.npy: ")
     assert told.startswith(f"{film}/front_01.npy: ")
-    assert len(json.loads(Path("out/film.json").read_text())["frames"]) == FRAMES - 1
+    assert len(json.loads(Path("out/film.json").read_text())["frames"]) == 2
     page, refresh = Path("out/report.html"), 'http-equiv="refresh"'
     assert refresh in page.read_text()
     np.save("front_01.npy", np.load("front_00.npy"))
-    assert run(*optimize("-o", "out", "--resume", *FEW)).exit_code == 0
+    assert run(*few, "--resume").exit_code == 0
     assert refresh not in page.read_text()
 
 

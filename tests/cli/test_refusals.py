@@ -130,12 +130,10 @@ def test_everything_is_told_at_once(refuse):
     assert [line.split(":")[0] for line in lines] == ["one.npy", "two.npy"]
 
 
-def test_a_run_cannot_go_on_as_another(refuse, succeed):
-    """Of another scene, with fewer iterations, or from checkpoints that are damaged or gone."""
+def test_a_run_does_not_go_on_with_less(refuse, succeed):
+    """With fewer iterations, or from checkpoints that are all damaged."""
     again = "optimize", "scene.yaml", "-o", "out", "--iterations", "2"
     succeed(*again)
-    (line,) = refuse(2, *again, "--resume", "-D", "volume.g=0.1")
-    assert "belongs to another scene; use another output folder: volume.g is 0.3 there" in line
     (line,) = refuse(2, *again[:-1], "1", "--resume")
     assert "2 iterations are made already" in line
     path = Path("out/checkpoints/last.pt")
@@ -145,9 +143,6 @@ def test_a_run_cannot_go_on_as_another(refuse, succeed):
             each.write_bytes(damage(each.read_bytes()))
         (line,) = refuse(3, *again, "--resume")
         assert re.match(f"{path.parent}/(last|previous).pt: ", line)
-    for each in files:
-        each.unlink()
-    assert refuse(2, *again, "--resume")[0].startswith(f"{path}: there is no checkpoint")
 
 
 @pytest.mark.parametrize("command", ["render scene.yaml -o out", "gradcheck scene.yaml"])

@@ -17,7 +17,7 @@ from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.scene_file.load import MAX_BYTES
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("untimed")]
 
 SCENE = """
 volume:
