@@ -85,9 +85,9 @@ def differentiated(scene, targets, memory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("misfit", [1.0, 0.01])
-def test_the_gradient_is_as_exact_as_promised(misfit, ball_scene):
+def test_the_gradient_is_as_exact_as_promised(misfit, coarse_ball):
     """Towards pictures that differ from the images by `misfit` of their size."""
-    scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, tolerance=1e-6))
+    scene = replace(coarse_ball, diffusion=replace(coarse_ball.diffusion, tolerance=1e-6))
     images = differentiated(scene, {}, SolveMemory()).images
     signs = [torch.where(torch.arange(image.shape[-1]) % 2 == 0, 1.0, -0.5) for image in images]
     changed = [image * (1 - misfit * sign) for image, sign in zip(images, signs, strict=True)]
@@ -102,9 +102,9 @@ def test_the_gradient_is_as_exact_as_promised(misfit, ball_scene):
 
 
 @pytest.mark.slow
-def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(ball_scene):
+def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(coarse_ball):
     changes = {"transport_rounds": 1, "tolerance": 1e-6, "warm_start": False}
-    scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, **changes))
+    scene = replace(coarse_ball, diffusion=replace(coarse_ball.diffusion, **changes))
     run = Reconstruction(scene, 3)
     while not run.is_done:
         asked = solve_tolerances(run.frames[0].misfit)

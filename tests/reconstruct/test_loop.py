@@ -35,26 +35,26 @@ def test_an_empty_volume_comes_closer_to_the_truth(ball_scene):
     assert result.rows[-1].test_psnr is not None
 
 
-def test_the_scene_itself_is_left_alone(ball_scene):
-    before = ball_scene.volume.density.clone()
-    optimize(ball_scene, iterations=2)
-    assert torch.equal(ball_scene.volume.density, before)
-    assert not ball_scene.volume.density.requires_grad
+def test_the_scene_itself_is_left_alone(coarse_ball):
+    before = coarse_ball.volume.density.clone()
+    optimize(coarse_ball, iterations=2)
+    assert torch.equal(coarse_ball.volume.density, before)
+    assert not coarse_ball.volume.density.requires_grad
 
 
-def test_test_views_do_not_influence_the_result(ball_scene):
-    views = [replace(view, image=view.image * (not view.is_test)) for view in ball_scene.views]
-    spoiled = replace(ball_scene, views=views)
-    one, other = (optimize(scene, iterations=3).scene.volume for scene in (ball_scene, spoiled))
+def test_test_views_do_not_influence_the_result(coarse_ball):
+    views = [replace(view, image=view.image * (not view.is_test)) for view in coarse_ball.views]
+    spoiled = replace(coarse_ball, views=views)
+    one, other = (optimize(scene, iterations=3).scene.volume for scene in (coarse_ball, spoiled))
     assert torch.equal(one.density, other.density)
 
 
-def test_a_view_of_weight_2_counts_as_two(ball_scene):
-    first, second = ball_scene.views[:2]
+def test_a_view_of_weight_2_counts_as_two(coarse_ball):
+    first, second = coarse_ball.views[:2]
     second = replace(second, image=first.image.flip(2))  # as bright, which is the unit of losses
 
     def evaluate(*views):
-        run = Reconstruction(replace(ball_scene, views=[*views]), 1)
+        run = Reconstruction(replace(coarse_ball, views=[*views]), 1)
         evaluation = run.frames[0].evaluate()
         return evaluation.loss, evaluation.gradients["density"]
 
@@ -74,9 +74,9 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["loss of view", "derivative of the loss"])
-def test_divergence_keeps_the_last_good_state(ball_scene, flaw, monkeypatch):
+def test_divergence_keeps_the_last_good_state(coarse_ball, flaw, monkeypatch):
     """Where no candidate, however near, can be looked at."""
-    run, again = Reconstruction(ball_scene), Reconstruction(ball_scene)
+    run, again = Reconstruction(coarse_ball), Reconstruction(coarse_ball)
     run.step()
     run.step()
     good = run.parameters[0].value.detach().clone()
@@ -97,8 +97,8 @@ def test_divergence_keeps_the_last_good_state(ball_scene, flaw, monkeypatch):
     assert torch.equal(run.parameters[0].value, again.parameters[0].value)
 
 
-def test_light_that_cannot_be_solved_for_shortens_a_step(ball_scene, monkeypatch):
-    run, failed = Reconstruction(ball_scene), list[str]()
+def test_light_that_cannot_be_solved_for_shortens_a_step(coarse_ball, monkeypatch):
+    run, failed = Reconstruction(coarse_ball), list[str]()
     run.step()
     candidate, evaluate = run.search.candidate, Frame.evaluate
 
@@ -114,9 +114,9 @@ def test_light_that_cannot_be_solved_for_shortens_a_step(ball_scene, monkeypatch
     torch.testing.assert_close(run.parameters[0].value.detach().flatten(), candidate / 2)
 
 
-def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene):
+def test_a_candidate_that_is_refused_is_logged_and_not_kept(coarse_ball):
     """Its row is of the volume that stays, as rows of others are."""
-    run = Reconstruction(ball_scene)
+    run = Reconstruction(coarse_ball)
     row, before = run.step(), run.parameters[0].value.detach().clone()
     # A step so long that all is fog.
     run.search._set_out(1e3 * run.search.step)
@@ -129,16 +129,16 @@ def test_a_candidate_that_is_refused_is_logged_and_not_kept(ball_scene):
     assert after.psnr == pytest.approx(run.frames[0].evaluate().psnr, abs=0.01)
 
 
-def test_a_scene_without_training_images_is_refused(ball_scene):
+def test_a_scene_without_training_images_is_refused(coarse_ball):
     with pytest.raises(SceneError, match="nothing to reconstruct from"):
-        tests = [view for view in ball_scene.views if view.is_test]
-        Reconstruction(replace(ball_scene, views=tests))
+        tests = [view for view in coarse_ball.views if view.is_test]
+        Reconstruction(replace(coarse_ball, views=tests))
     with pytest.raises(SceneError, match="missing section"):
-        Reconstruction(replace(ball_scene, optimize=None))
+        Reconstruction(replace(coarse_ball, optimize=None))
 
 
-@pytest.mark.parametrize("fewest", [16, 8, 4])
-def test_a_line_through_two_resolutions(ball_scene, monkeypatch, fewest):
+@pytest.mark.parametrize("fewest", [8, 4, 2])
+def test_a_line_through_two_resolutions(coarse_ball, monkeypatch, fewest):
     """By a clock that counts 0.25 s and a millisecond a cell; twice that the first time."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", fewest)
     clock, known, evaluate = [0.0], set[int](), Frame.evaluate
@@ -151,9 +151,9 @@ def test_a_line_through_two_resolutions(ball_scene, monkeypatch, fewest):
 
     monkeypatch.setattr(Frame, "evaluate", evaluate_slowly)
     monkeypatch.setattr(loop, "perf_counter", lambda: clock[0])
-    cells = ball_scene.volume.grid.cells
-    assert loop.time_iteration(ball_scene) == pytest.approx(0.25 + cells / 1000)
-    assert len(known) == (1 if fewest == 16 else 2)
+    cells = coarse_ball.volume.grid.cells
+    assert loop.time_iteration(coarse_ball) == pytest.approx(0.25 + cells / 1000)
+    assert len(known) == (1 if fewest == 8 else 2)
 
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]

@@ -50,6 +50,7 @@ def assert_same(objective, plain):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("scene", ["warp"], indirect=True)
 def test_replays_are_plain_iterations(scene):
     """Of other values and views than those that were recorded, and after other views."""
     memory = SolveMemory()
@@ -95,11 +96,11 @@ def test_what_cannot_be_recorded_runs_plainly(scene, caplog):
 
 
 @pytest.mark.slow
-def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(ball_scene):
+def test_a_recorded_run_goes_on_from_its_state_to_the_same_bits(coarse_ball):
     """It records anew what the whole run has recorded before."""
     use_engine("warp")
-    render = replace(ball_scene.render, tolerance=0)
-    whole, resumed = (Reconstruction(replace(ball_scene, render=render)) for _ in range(2))
+    render = replace(coarse_ball.render, tolerance=0)
+    whole, resumed = (Reconstruction(replace(coarse_ball, render=render)) for _ in range(2))
 
     recorded = list[Reconstruction]()
 

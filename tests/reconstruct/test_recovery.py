@@ -119,13 +119,13 @@ def test_all_together_render_as_the_truth():
     """Also with the density, which then has light and medium to share its level with.
 
     The way there depends on rounding: of densities that begin 1e-5 apart, 120 iterations leave 0.07
-    to 0.16, and runs that come to rest before 200 at most 0.08.
+    to 0.16.
     """
     scene = photographed(scene_of(cloud(9), 3, 10))
     starts = STARTS | {"density": 0.5 * scene.volume.density + 0.1}
-    found = recovered(scene, starts, 200, density=ParameterSettings(tv=0.0))
+    found = recovered(scene, starts, 120, density=ParameterSettings(tv=0.0))
     assert image_error(with_values(scene, starts), scene) > 0.5
-    assert image_error(found, scene) < 0.12
+    assert image_error(found, scene) < 0.2
 
 
 def test_a_phase_function_that_scatters_backward():

@@ -113,8 +113,8 @@ def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
 
 
 @pytest.mark.slow
-def test_a_run_rests_within_the_noise_that_is_known(ball_scene):
-    run = Reconstruction(ball_scene, AUTO)
+def test_a_run_rests_within_the_noise_that_is_known(coarse_ball):
+    run = Reconstruction(coarse_ball, AUTO)
     while not run.is_done:
         run.step()
     ending = run.ending()

@@ -57,7 +57,7 @@ def scene_of(kind):
         )
         for seed, (view, image) in enumerate(zip(views, images, strict=True))
     ]
-    settings = OptimizeSettings(SOUGHT[kind], iterations=3, noise=NoiseSettings(read=0.05))
+    settings = OptimizeSettings(SOUGHT[kind], iterations=2, noise=NoiseSettings(read=0.05))
     world = replace(world, views=shown, optimize=settings)
     volume, starts = world.volume, {"density": torch.zeros_like(density)}
     if kind == "cameras":
