@@ -21,7 +21,6 @@ from ddrecon.kernels import text
 
 ORDERS: dict[str, Callable[[int], int]] = {
     "forward": lambda count: 1,
-    "backward": lambda count: count - 1,
     "scattered": lambda count: next(
         step for step in range(int(0.618 * count) + 1, count + 2) if math.gcd(step, count) == 1
     ),

@@ -85,14 +85,6 @@ def test_a_graph_can_be_gone_back_through_twice():
     assert torch.equal(once, again)
 
 
-def test_what_inference_mode_made_serves_derivatives_later():
-    scene = cloud()
-    use_engine("warp")
-    with torch.inference_mode():
-        render_each(scene, scene.views, SolveMemory())
-    differentiate("warp", images_of(scene), values_of(scene, VARIED[cloud]))
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("model", ["p1", "none"])
 def test_a_density_that_is_no_number_is_seen(engine, model):

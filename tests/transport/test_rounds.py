@@ -68,7 +68,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
 @pytest.mark.parametrize(("g", "engine"), [(0.0, "warp"), (0.6, "torch"), (0.85, "warp")])
 def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g, engine):
     """And light is as near to its limit as that says, in fewer rounds the larger it is."""
-    scene = make_scene(ball(), sigma_a=(1.0,), sigma_s=(20.0,), g=g, directional=(3.0,))
+    scene = make_scene(ball(8), sigma_a=(1.0,), sigma_s=(20.0,), g=g, directional=(3.0,))
     records, found = [], []
     use_engine(engine)
     limit = light_after(scene, 16)
@@ -112,11 +112,11 @@ def left_of_noise(density, spacing, depth, g, degree, rounds):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("g", "degree", "thickness"),
-    [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.85, 5, 1.5), (0.85, 7, 1.5), (0.95, 5, 1.5), (0.95, 7, 6.0)],
+    [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.95, 5, 1.5), (0.95, 7, 6.0)],
 )
 def test_rounds_forget_where_they_began(g, degree, thickness):
     """In a box full of medium, where diffusion passes few waves on."""
-    full = torch.ones(12, 12, 12, dtype=torch.float64)
+    full = torch.ones(10, 10, 10, dtype=torch.float64)
     (begun, left) = left_of_noise(full, CUBES, thickness, g, degree, (0, 16))
     assert left < 2e-3 * begun
 
