@@ -91,9 +91,8 @@ def test_engines_have_the_same_tangents_and_gradients(case):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("case", ["forward, degree 3", "flux limited"])
-def test_single_precision_is_close_to_double(case, engine):
-    scene = scene_of(case)
+def test_single_precision_is_close_to_double(engine):
+    scene = scene_of("forward, degree 3")
     values = values_of(scene, [n for n in variables_of(scene) if not n.endswith(MOVES)])
     single = {name: value.float() for name, value in values.items()}
     known = differentiate("torch", images_of(scene), values, has_tangent=True)

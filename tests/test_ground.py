@@ -164,7 +164,7 @@ def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["p1", "coarse", "maps"])
+@pytest.mark.parametrize("kind", ["coarse", "maps"])
 def test_tangent_adjoint_and_differences_agree(kind, monkeypatch):
     if kind == "coarse":
         monkeypatch.setattr(lighting, "MOST_CELLS", 4)

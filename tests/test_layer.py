@@ -13,7 +13,6 @@ import pytest
 import torch
 from media import make_scene, random_values, tensor
 from scenes import cloud
-from torch import Tensor
 
 import ddrecon
 from ddrecon.engine import ENGINES
@@ -65,21 +64,15 @@ def lit_scene():
     return scene
 
 
-CHANGES: dict[str, Callable[[Tensor], object]] = {
-    "NumPy": lambda value: np.copyto(value.numpy(), value.lerp(torch.ones_like(value), 0.3)),
-    "data": lambda value: value.data.lerp_(torch.ones_like(value), 0.3),
-}
-
-
 @pytest.mark.usefixtures("few_directions")
-@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_tensor_that_changed_unseen_is_as_a_new_one(change):
+def test_a_tensor_that_changed_unseen_is_as_a_new_one():
     """No picture depends on what was rendered before, however a scene's numbers have changed."""
     scene = lit_scene()
     before = render(scene)
     for name in variable_names(scene):
         if not name.startswith("views.") and name not in EXTINCTION_AND_ALBEDO:
-            change(value_of(scene, name))
+            value = value_of(scene, name)
+            np.copyto(value.numpy(), value.lerp(torch.ones_like(value), 0.3))
     after = render(scene)
     assert not torch.equal(after, before)
     assert torch.equal(after, render(replace(deepcopy(scene))))
@@ -165,8 +158,9 @@ BATCHES = {
 )
 def test_one_axis_more_than_a_number_may_have_is_a_batch(name, shape, count):
     value = 0.3 + 0.1 * random_values(*shape)
-    images = small_layer()(values={name: value})
-    alone = small_layer()(values={name: value if count is None else value[0]})
+    layer = VolumeRenderer(make_scene(random_values(*SHAPE), model="none"))
+    images = layer(values={name: value})
+    alone = layer(values={name: value if count is None else value[0]})
     assert images.shape == (alone.shape if count is None else (count, *alone.shape))
     torch.testing.assert_close(images if count is None else images[0], alone)
 

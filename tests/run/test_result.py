@@ -20,16 +20,15 @@ LIGHTS = """[{type: directional, direction: [-1, -2, -1], irradiance: 3},
  {type: environment, file: %s/sky.npy, scale: 0.5, rotation: 20, directions: 6},
  {type: point, position: [0.9, 0.8, 0.3], intensity: 1}]"""
 FLAT = "{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [5, 4]}"
+NUMBERS = """sigma_t: {}, g: {}, lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {},
+ lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {},
+ lights.2.position: {}, lights.2.intensity: {}, views.front.camera: {}"""
 VARIED = [
     ("density: {init: 0.2}", ["density"]),
     ("sigma_a: {init: [0.5, 1, 2], field: true}, sigma_s: {}", ["sigma_a"]),
     ("albedo: {init: 0.8, field: true}, density: {}", ["density", "albedo"]),
-    ("sigma_t: {}, g: {}", []),
-    ("lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}", []),
-    ("lights.2.position: {}, lights.2.intensity: {}", []),
-    ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),
     ("g: {init: 0.5, field: true}", ["g"]),
-    ("views.front.camera: {}", []),
+    (NUMBERS, []),
 ]
 
 
