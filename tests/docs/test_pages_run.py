@@ -52,7 +52,7 @@ def quick(command):
     _, name, *rest = shlex.split(command, comments=True)
     added = {
         "optimize": ["--iterations", str(1 + ("--resume" in rest)), *NO_ROUNDS],
-        "render": ["--ring", "2"] if "--ring" in rest else [],
+        "render": ["--size", "32", "24", *(["--ring", "2"] if "--ring" in rest else [])],
         "reference": ["--spp", "4"],
         "gradcheck": [*ONE_PARAMETER, *NO_ROUNDS, "-D", "ground=null"],
     }.get(name, [])

@@ -61,7 +61,7 @@ def test_every_parameter_passes(name, overrides):
 
 
 def test_all_at_once_pass(monkeypatch):
-    overrides = [*SMALL, "diffusion.transport_rounds=1"]
+    overrides = [*SMALL, *ONE_ROUND]
     scene = load_scene(CONFIG, overrides=overrides, dtype=torch.float64)
     # None of them alone: `test_every_parameter_passes` checks those.
     monkeypatch.setattr(gradcheck, "show_progress", lambda names, _: names[:0])

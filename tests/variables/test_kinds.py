@@ -1,4 +1,4 @@
-"""The table of variables: every kind can be set, differentiated and optimized as its row says."""
+"""The table of variables: every kind can be set and optimized as its row says."""
 
 from pathlib import Path
 
@@ -6,7 +6,6 @@ import pytest
 import torch
 from media import make_scene
 
-from ddrecon.picture import render
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
@@ -57,20 +56,16 @@ def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes):
     assert {pattern_of(name) for name in names} == set(KINDS)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("pattern", KINDS)
-def test_a_kind_is_settable_alone_and_differentiable(scene, pattern):
-    """The scene keeps its own value, and what is put in comes out again; all else stays."""
+def test_a_kind_is_settable_alone(scene, pattern):
+    """The scene keeps its own value, and what is put in comes out again; all else stays.
+
+    What pictures have of its derivative is in `tests/validate/test_gradcheck.py`.
+    """
     name = name_of(pattern, scene)
     before = value_of(scene, name).clone()
-    value = (0.9 * before + 0.01).requires_grad_()
+    value = 0.9 * before + 0.01
     changed = with_values(scene, {name: value})
-    view = name.split(".")[1] if name.startswith("views.") else "front"
-    image = render(changed, view)
-    assert not torch.allclose(image, render(scene, view))
-    (gradient,) = torch.autograd.grad(image.sum(), value)
-    assert gradient.isfinite().all() and gradient.any()
     # a camera that was moved is as far from itself as before: not at all
     expected = torch.zeros_like(value) if pattern == "views.NAME.camera" else value
     torch.testing.assert_close(value_of(changed, name), expected, rtol=1e-14, atol=0)
