@@ -160,50 +160,36 @@ def test_other_axes_are_not_taken_for_x_y_or_z(tmp_path, name, attributes):
     assert f"QN has 2 entries along '{name}'; choose one" in refusal(path, "QN")
 
 
-METERS = dict.fromkeys("xyz", "m")
+NO_LENGTH = """
+x lon units=degrees_east => lon is in degrees_east, which is no known length; project
+y rlat units=degrees => rlat is in degrees, which is no known length; project
+x x units=rad => x is in rad, which is no known length
+y y units=Mm => y is in Mm, which is no known length
+z plev units=hPa positive=down => plev is in hPa, which is no known length
+z z units=mbar => z is in mbar, which is no known length; interpolate to heights
+z lev units=1 => lev is in 1, which is no known length; interpolate to heights
+z level => level says no unit of length; interpolate to heights
+z p axis=Z => p says no unit of length; interpolate to heights
+z k standard_name=model_level_number => k says no unit of length; interpolate
+z z => z says no unit of length, others do; say it (ncatted
+y y => y says no unit of length, others do; say it (ncatted
+z depth absent => depth says no unit of length; interpolate to heights
+z sigma absent => sigma says no unit of length; interpolate to heights
+"""
+"""An axis, its name, the attributes of its coordinate unless that is absent; and a line."""
 
 
-@pytest.mark.parametrize(
-    ("renamed", "attributes", "told"),
-    [
-        (
-            "x lon",
-            {"units": "degrees_east"},
-            "lon is in degrees_east, which is no known length; project",
-        ),
-        ("y rlat", {"units": "degrees"}, "rlat is in degrees, which is no known length; project"),
-        ("x x", {"units": "rad"}, "x is in rad, which is no known length"),
-        ("y y", {"units": "Mm"}, "y is in Mm, which is no known length"),
-        (
-            "z plev",
-            {"units": "hPa", "positive": "down"},
-            "plev is in hPa, which is no known length",
-        ),
-        (
-            "z z",
-            {"units": "mbar"},
-            "z is in mbar, which is no known length; interpolate to heights",
-        ),
-        ("z lev", {"units": "1"}, "lev is in 1, which is no known length; interpolate to heights"),
-        ("z level", {}, "level says no unit of length; interpolate to heights"),
-        ("z p", {"axis": "Z"}, "p says no unit of length; interpolate to heights"),
-        ("z k", {"standard_name": "model_level_number"}, "k says no unit of length; interpolate"),
-        ("z z", {}, "z says no unit of length, others do; say it (ncatted"),
-        ("y y", {}, "y says no unit of length, others do; say it (ncatted"),
-        ("z depth", None, "depth says no unit of length; interpolate to heights"),
-        ("z sigma", None, "sigma says no unit of length; interpolate to heights"),
-    ],
-)
-def test_what_is_no_length_is_refused(tmp_path, renamed, attributes, told):
+@pytest.mark.parametrize("row", NO_LENGTH.strip().splitlines())
+def test_what_is_no_length_is_refused(tmp_path, row):
     """Degrees, pressures, numbers of levels, and silence beside meters."""
-    axis, name = renamed.split()
-    axes = plain(**METERS)
+    coordinate, _, told = row.partition(" => ")
+    axis, name, *attributes = coordinate.split()
+    axes = plain(**dict.fromkeys("xyz", "m"))
     numbers, _ = axes.pop(axis)
-    if attributes is not None:
-        axes[name] = numbers, attributes
-    assert told in refusal(
-        written(tmp_path / "f.nc", VALUES, "z y x".replace(axis, name), **axes), "QN"
-    )
+    if attributes != ["absent"]:
+        axes[name] = numbers, dict(attribute.split("=") for attribute in attributes)
+    dimensions = "z y x".replace(axis, name)
+    assert told in refusal(written(tmp_path / "f.nc", VALUES, dimensions, **axes), "QN")
 
 
 def test_packed_values_are_unpacked(tmp_path):
