@@ -19,7 +19,6 @@ from ddrecon.validate.gradcheck import check_parameters
 SHAPE = (5, 4, 6)
 BOTH = {"directional": (3.0, 2.0, 1.0), "ambient": (0.3, 0.4, 0.5)}
 INSIDE = {"eye": (0.1, 0.1, 0.2), "half_width": 0.8}
-PARALLEL = {"eye": (0.4, 0.6, 2.5), "half_width": 0.7, "is_perspective": False}
 
 
 def components(scene):

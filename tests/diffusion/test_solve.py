@@ -17,7 +17,6 @@ from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 
-Shape = tuple[int, ...]
 SHAPES = [(1, 1, 1), (1, 1, 9), (1, 12, 17), (2, 3, 40), (7, 8, 9)]
 FORMS = {
     "slab": ((1, 40, 40), (0.025, 1, 1)),
