@@ -10,7 +10,10 @@ from ddrecon.picture import render
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.scene_file.build import load_scene
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
+FOLDER = Path(__file__).parents[2] / "configs"
+CONFIGS = sorted(path for path in FOLDER.rglob("*.yaml") if path.stem != "cloud")
+"""But the one whose volume is for its user to download."""
+
 NEEDS = {"mie": "miepython", ".exr": "OpenImageIO"}
 """What configs with these words need."""
 

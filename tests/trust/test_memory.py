@@ -49,6 +49,7 @@ def require_fit(run, line, *command):
         assert run(*command, *words).exit_code == 0
 
 
+@pytest.mark.usefixtures("untimed")
 @pytest.mark.parametrize(
     "change",
     [
