@@ -127,6 +127,16 @@ def test_samples_are_centers_of_equal_parts(samples):
     assert second_moments.tolist() == pytest.approx(expected, abs=1e-14)
 
 
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_a_pixel_is_as_wide_as_the_rays_of_neighbors_are_apart(is_perspective):
+    view = camera((3, 50), is_perspective=is_perspective)
+    rays, backward = cast_rays(view), view.pose[:, 2].flip(0)
+    reach = ((TARGET.flip(0) - rays.origin) @ backward) / (rays.direction @ backward)
+    places = (rays.origin + reach[:, None] * rays.direction)[50 + 24 : 50 + 26]
+    apart = float(places[0].dist(places[1]))
+    assert pixel_width(view, TARGET) == pytest.approx(apart, rel=1e-12)
+
+
 # --- twists ---
 
 PIVOT = (0.2, -0.1, 0.4)

@@ -23,7 +23,7 @@ from ddrecon import lighting
 from ddrecon.cameras import Camera, look_at
 from ddrecon.errors import FormatError
 from ddrecon.grid import Grid
-from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
+from ddrecon.light.ground import Ground, Plane, hemisphere, look_up_texels, texel_centers
 from ddrecon.light.lights import (
     AmbientLight,
     BeamLight,
@@ -213,6 +213,15 @@ def test_units_and_the_way_up_do_not_matter(turns, size):
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
     found, known = render(moved(scene, turns, size)), render(scene)
     torch.testing.assert_close(found, known, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0])
+def test_even_light_from_a_hemisphere_has_its_irradiance(power):
+    """The integral of the cosine, pi, whatever the axis and number of directions."""
+    for axis, count in ((0, 5), (1, 24), (2, 1)):
+        directions, angles = hemisphere(axis, count, power)
+        torch.testing.assert_close(directions.norm(dim=1), torch.ones(count).double())
+        assert float((directions[:, axis] * angles).sum()) == pytest.approx(math.pi)
 
 
 def test_lights_from_below_are_hidden():

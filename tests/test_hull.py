@@ -9,7 +9,7 @@ from media import make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.hull import bounds_text, doubt_box
+from ddrecon.hull import bound_smoke, bounds_text, doubt_box
 from ddrecon.picture import render
 from ddrecon.scene import View, place_turntable, upright_axis
 
@@ -40,6 +40,19 @@ def test_a_box_that_is_off_is_doubted_and_a_better_one_named(fault):
     assert (doubt is None) == (not words)
     for word in words:
         assert word in str(doubt) and bounds_text(shown) in str(doubt)
+
+
+def test_the_box_of_what_cameras_show_holds_it_and_hardly_more():
+    """A square within 0.3 of the middle, by parallel rays along z, y and x."""
+    eyes, origin = 3 * torch.eye(3).double(), torch.zeros(3).double()
+    cameras = [Camera(look_at(eye, origin, eye.roll(1)), (40, 40), 1.0, False) for eye in eyes]
+    shown = torch.zeros(40, 40, dtype=torch.bool)
+    shown[14:26, 14:26] = True
+    views = [View("view", camera) for camera in cameras]
+    low, high = bound_smoke([(views, [shown] * 3)], 0.0)
+    assert float(low.max()) <= -0.3 and float(high.min()) >= 0.3
+    assert float(high.max()) < 0.35
+    torch.testing.assert_close(low, -high)
 
 
 CENTER = (0.1, -0.2, 0.3)

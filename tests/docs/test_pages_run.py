@@ -31,7 +31,7 @@ def commands(page):
 
 
 def fewer_cells(scene):
-    """Overrides that leave `scene` about 8 cells along its shortest side, where it has a number."""
+    """Overrides that leave `scene` about 5 cells along its shortest side, where it has a number."""
     found = re.search(
         r"^  resolution: \[(\d+), (\d+), (\d+)\]",
         Path(scene).read_text(encoding="utf-8"),
@@ -39,7 +39,7 @@ def fewer_cells(scene):
     )
     sizes = [int(size) for size in found.groups()] if found else []
     return (
-        ["-D", f"volume.resolution={[size * 8 // min(sizes) for size in sizes]}"] if sizes else []
+        ["-D", f"volume.resolution={[size * 5 // min(sizes) for size in sizes]}"] if sizes else []
     )
 
 

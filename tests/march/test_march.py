@@ -112,7 +112,7 @@ def test_a_box_behind_the_camera_is_not_seen():
     assert not scattered.any() and bool((transmittance == 1).all())
 
 
-@each_camera
+@pytest.mark.parametrize("view", [VIEWS["oblique"], VIEWS["inside"]], ids=["oblique", "inside"])
 def test_chunks_do_not_matter(view, monkeypatch):
     """Neither to what is seen nor to its derivative."""
     density = (0.1 + half_empty(9, 11, 10)).requires_grad_()

@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 from ddrecon.numerics import remember as module
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.numerics.remember import forget_changed, is_any_nonzero, remember
+from ddrecon.numerics.remember import constant, forget_changed, is_any_nonzero, remember
 
 
 def curved(x, y):
@@ -176,6 +176,14 @@ def test_what_was_found_in_inference_mode_serves_derivatives(doubled):
         double(values)
     (other * double(values)).sum().backward()
     assert torch.equal(other.grad, torch.full((3,), 2.0))
+
+
+def test_constants_of_inference_mode_serve_derivatives():
+    leaf = torch.ones(3, requires_grad=True)
+    with torch.inference_mode():
+        numbers = constant((0.3, 7.1, 2.9), leaf)
+    (leaf * numbers).sum().backward()
+    assert torch.equal(leaf.grad, numbers)
 
 
 def test_more_than_there_is_room_for_is_not_kept(doubled, monkeypatch):

@@ -1,6 +1,7 @@
 """The search for a minimum within bounds, of quadratics and of what bends more."""
 
 import io
+import math
 
 import pytest
 import torch
@@ -151,7 +152,9 @@ def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has():
     search = begin(quadratic, start, space, prior)
     for _ in range(4):
         search.judge(objective_of(quadratic, search.candidate, prior))
+    assert search.gain < math.inf
     search.reweigh(0.25)
+    assert search.gain == math.inf  # what was known of it was by the weight before
     slope = search.objective.slope(0.25)
     x = search.values
     torch.testing.assert_close(slope, MATRIX @ (x - TARGET) + 0.5 * x)

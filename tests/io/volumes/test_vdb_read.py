@@ -15,7 +15,7 @@ from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import read_field
 
 NONE, ZIP, MASK, BLOSC = 0, 1, 2, 4
-QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=20)
+QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=10)
 HALF = 0.5
 
 
