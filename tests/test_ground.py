@@ -139,6 +139,7 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun():
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_volume_takes_of_a_sky_what_it_takes_of_its_parallel_lights():
     """Those that are less bright than its mean take away: 7 % are left of texels."""
     around = (torch.arange(16, dtype=torch.float64) + 0.5) * (2 * math.pi / 16)

@@ -86,6 +86,7 @@ def test_even_light_is_n_squared_times_as_bright_inside(changes):
     torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
 
 
+@pytest.mark.slow
 def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matters():
     settings = {"directional": None, "ambient": (0.7,), "model": "none"}
     even, directed = (
@@ -129,6 +130,7 @@ def test_no_power_is_lost_or_made(light):
         assert report["fractions"]["reflected"] == pytest.approx(outer)
 
 
+@pytest.mark.slow
 def test_layers_reflect_and_transmit_as_by_adding_and_doubling():
     iadpython = pytest.importorskip("iadpython", reason="adding and doubling is an extra (`dev`)")
     grid = Grid((1, 24, 1), (-500.0, -0.5, -500.0), (500.0, 0.5, 500.0))

@@ -64,6 +64,7 @@ def lit_scene():
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_directions")
 def test_a_tensor_that_changed_unseen_is_as_a_new_one():
     """No picture depends on what was rendered before, however a scene's numbers have changed."""

@@ -143,6 +143,7 @@ def even(*shape):
     return torch.full(shape, 0.3, dtype=torch.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("albedo, exchanges", [(0.05, 1), (0.2, 2), (0.3, 3)])
 def test_light_goes_to_a_dark_ground_and_back_no_more_often_than_is_seen(albedo, exchanges):
     scene = repeated(half_empty(*SHAPE), **KINDS["isotropic"])

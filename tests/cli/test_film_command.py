@@ -176,6 +176,7 @@ def test_a_frame_keeps_a_part_of_its_start(whole, succeed):
     np.testing.assert_allclose(kept, (1 - MIXED) * bare + MIXED * start, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_part_far_from_others_knows_nothing_of_them(film, succeed):
     """It begins from nothing, and its first frame moves as the second does."""
     for name in VIEWS:
@@ -298,6 +299,7 @@ def test_from_python(whole, film):
         next(ddrecon.optimize_sequence("scene.yaml"))
 
 
+@pytest.mark.slow
 def test_a_frame_that_fails_is_named_and_left_to_a_resume(film, run):
     Path("front_01.npy").write_bytes(b"broken")
     few = optimize("-o", "out", "-D", "frames.last=2", *FEW)
@@ -381,6 +383,7 @@ def test_a_sequence_is_turned_and_moves_by_the_second(film, whole, succeed):
     assert fps == 25 and "velocity [u/s]" in units
 
 
+@pytest.mark.slow
 def test_a_part_done_anew_leaves_all_else(film, run, succeed, refuse, monkeypatch):
     """And nothing is touched while another process is there, or where it is another film."""
     succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *ALONE))

@@ -132,6 +132,7 @@ TRACED = [
 """What was traced, beside the config."""
 
 
+@pytest.mark.slow
 def test_the_plumes_derivative_is_that_of_a_path_tracer():
     scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=TRACED)
     density = scene.volume.density

@@ -26,6 +26,7 @@ def error_of(density):
     return float((density - truth).abs().sum() / truth.sum())
 
 
+@pytest.mark.slow
 def test_an_empty_volume_comes_closer_to_the_truth(ball_scene):
     result = optimize(ball_scene, iterations=12)
     losses = [row.loss for row in result.rows]

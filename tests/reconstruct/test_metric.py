@@ -70,6 +70,7 @@ def curvature():
     return Curvature(scene, parameters, values, weights, matrix)
 
 
+@pytest.mark.slow
 def test_it_is_the_part_of_the_matrix_between_numbers(curvature, monkeypatch):
     """By differences: to first order in how long these are."""
     numbers = Numbers(curvature.scene, curvature.parameters).places

@@ -97,6 +97,7 @@ FAULTS = {"clean": (lambda scene: None, 24), "exposure": (expose, 24), "cameras"
 FAULTS |= {"overfit": (keep_one, 50), "unfinished": (start_empty, 5), "empty": (start_empty, 1)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_fault_is_told_and_no_other(kind):
     fault, iterations = FAULTS[kind]

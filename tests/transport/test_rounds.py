@@ -65,6 +65,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("g", "engine"), [(0.0, "warp"), (0.6, "torch"), (0.85, "warp")])
 def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g, engine):
     """And light is as near to its limit as that says, in fewer rounds the larger it is."""

@@ -41,8 +41,13 @@ BROKEN = [
 ]
 
 
+EASIER = {f"optical depth 1e{power} a cell" for power in ("-4", "-2", "+1")}
+EASIER |= {"voxels 1 : 5 : 0.2", "light along -y"}
+"""Than others of the same kind; `ddrecon bench --hard` takes all."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if name not in EASIER])
 def test_a_hard_case_keeps_its_bounds(name):
     report = run_case(CASES[name], CPU)
     assert report["failures"] == [], report
