@@ -138,6 +138,15 @@ def test_pages_quote_no_other_figure(name):
     assert [line for line in text.splitlines() if MEASURED.search(line)] == []
 
 
+def test_every_experiment_of_the_paper_has_a_config_and_a_picture():
+    names = {config.stem for config in (ROOT / "configs" / "paper").glob("*.yaml")}
+    page = (ROOT / "docs" / "experiments.md").read_text()
+    pictures = re.findall(r"\]\((pictures/paper/.*?)\)", page)
+    assert names <= {Path(picture).stem for picture in pictures}
+    assert {int(name[3:5]) for name in names} == {6, 7, 8, 9, 10, 12, 13, 14}
+    assert max((ROOT / "docs" / picture).stat().st_size for picture in pictures) < 150_000
+
+
 # --- equations ---
 
 TAG = re.compile(r"\bE(\d+)\.(\d+)(?:-E?\1\.(\d+))?\b")
