@@ -208,6 +208,22 @@ def test_the_shift_of_a_smooth_picture_is_found(move):
     assert found == pytest.approx(move, abs=0.01) and explained > 0.99
 
 
+def test_a_held_out_picture_is_compared_by_its_own_exposure():
+    """Where exposures are found, twice as bright a picture is as well explained."""
+    rows = []
+    for factor in (1.0, 2.0):
+        torch.manual_seed(0)
+        scene = make_scene("optimize.parameters.views.train_0.exposure={}")
+        (view,) = (view for view in scene.views if view.is_test)
+        view.image = factor * view.image
+        run = Reconstruction(scene, 1)
+        run.step()
+        rows.append(find_results(run).quality[view.name])
+    assert rows[1]["psnr"] == pytest.approx(rows[0]["psnr"], abs=1e-3)
+    one, other = (torch.tensor(row["fitted_exposure"]) for row in rows)
+    torch.testing.assert_close(other, 2 * one, rtol=1e-3, atol=0)
+
+
 GAINS = {"a": 1.1, "b": 1.2, "c": 0.5, "d": 1.5, "e": 1 / 1.1, "f": 0.8, "g": 1.9}
 MOVES = {"a": 0.4, "b": 0.6, "c": 1.3, "d": -1.0, "e": 0.8, "f": -1.1}
 
