@@ -18,6 +18,7 @@ from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import Differentiated, Replays, solve_tolerances
 from ddrecon.reconstruct.metric import Point
 from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
+from ddrecon.reconstruct.parameters import by_coordinates
 from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
@@ -72,8 +73,9 @@ class Result:
 class Evaluation:
     """What a frame adds to the objective, and the images that were `compared` for it.
 
-    These are the `loss` of images and the `prior`, with their derivatives by name, relative to the
-    mean square of the targets; `psnr` [dB] is the images' mean.
+    These are the `loss` of images and the `prior`, with their derivatives by what the search moves
+    of each parameter, by name, relative to the mean square of the targets; `psnr` [dB] is the
+    images' mean.
     """
 
     loss: float
@@ -119,16 +121,14 @@ class Frame:
         numbers = None
         while numbers is None:
             differentiated = self._differentiate(compared)
-            priors = {p.name: pair for p in self.parameters if (pair := p.penalty()) is not None}
-            terms = (value for value, _ in priors.values())
-            penalty = sum(terms, differentiated.loss.new_zeros(()))
+            penalty, prior_bars = self._smooth(differentiated.loss.new_zeros(()))
             numbers = compared.read(differentiated, penalty, self.parameters)
             if numbers is None:
                 self.replays.forget(compared, self.memory)
         of_images, prior, psnr = numbers
         self.misfit = math.sqrt(of_images / unit)
         relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
-        bars = {name: bar for name, (_, bar) in priors.items()}
+        relative, bars = (by_coordinates(self.parameters, x) for x in (relative, prior_bars))
         return Evaluation(of_images / unit, prior, relative, bars, psnr, compared)
 
     def noise_loss(self) -> float:
@@ -226,6 +226,16 @@ class Frame:
         self.memory.last = dict(state["solutions"])
         # By which iterations are recorded on a GPU.
         self.memory.iterations = dict(state["iterations"])
+
+    def _smooth(self, zero: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The sum of all penalties, and its derivatives by name; `zero` where there are none."""
+        smoothed = [p for p in self.parameters if p.tv]
+        if not smoothed:
+            return zero, {}
+        total = torch.stack([p.penalty() for p in smoothed]).sum()
+        reached = {p.name: p.value for p in (*smoothed, *(p.medium for p in smoothed if p.medium))}
+        bars = torch.autograd.grad(total, [*reached.values()])
+        return total.detach(), dict(zip(reached, bars, strict=True))
 
     def _differentiate(self, compared: Comparison) -> Differentiated:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""

@@ -172,6 +172,7 @@ class Reconstruction:
         self.numbers.matrix, self.numbers.prior = state["numbers"]
         state = _as(self.problem.scene.volume.density, dict(state))
         self.schedule.progress = Progress(**state["progress"])
+        self._turn()
         for frame, of_frame in zip(self.frames, state["frames"], strict=True):
             frame.restore(of_frame, self.schedule.stage.level)
         self._begin_search([], [], 1.0)
@@ -194,6 +195,9 @@ class Reconstruction:
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""
         pairs = [[self._split(vector) for vector in pair] for pair in self.search.pairs]
+        scales = self.search.scales
+        if self._turn():
+            pairs, scales = [], []
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
 
@@ -203,13 +207,20 @@ class Reconstruction:
 
         # How the objective bends, and how long the metric is, hardly changes with resolution.
         carried = [(carry(a, False), carry(b, True), carry(c, True)) for a, b, c in pairs]
-        self._begin_search(carried, self.search.scales, self.search.weight)
+        self._begin_search(carried, scales, self.search.weight)
+
+    def _turn(self) -> bool:
+        """Has the search move what the stage says of what glows; whether that is another."""
+        before = [p.is_per_depth for p in self.blocks]
+        for p in self.blocks:
+            p.is_per_depth = p.medium is not None and self.schedule.stage.is_per_depth
+        return before != [p.is_per_depth for p in self.blocks]
 
     def _begin_search(self, pairs: list[Pair], scales: list[float], weight: float) -> None:
         self.diagonal = torch.empty(0)
         sizes = [p.value.numel() for p in self.blocks if p not in self.numbers.places]
         sizes += [self.numbers.size] if self.numbers.size else []
-        start = self._project(self._map(lambda p: p.value.detach()))
+        start = self._project(self._map(lambda p: p.coordinate))
         space = Space(self._project, self._free, self._metric, sizes)
         self.search: Search = Search(space, start, weight, pairs, scales)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
@@ -268,7 +279,8 @@ class Reconstruction:
     def _metric(self, values: Tensor, free: Tensor, vectors: Tensor) -> Tensor:
         """The inverse metric at `values`, of what is `free`, times `vectors` [m, n]."""
         waiting, weight, results = self.schedule.stage.waiting, self.search.weight, list[Tensor]()
-        entries = map(self._split, (values, free, self.diagonal))
+        entries = list(map(self._split, (values, free, self.diagonal)))
+        known = dict(zip(self.blocks, entries[0], strict=True))
         groups = vectors.split(self.search.space.sizes, 1)
         for p, value, is_free, diagonal, group in zip(self.blocks, *entries, groups, strict=False):
             if p in self.numbers.places:
@@ -276,14 +288,18 @@ class Reconstruction:
                 break
             residuals = group.reshape(-1, *value.shape)
             if p.tv and p.name not in waiting:
-                moves = apply_metric(p, value, diagonal, weight, is_free, residuals)
+                knee = p.knee_at(None if p.medium is None else known[p.medium])
+                moves = apply_metric(p, value, knee, diagonal, weight, is_free, residuals)
             else:
                 moves = residuals * (is_free / diagonal)
             results.append(moves.flatten(1))
         return torch.cat(results, 1)
 
     def _put(self, values: Tensor) -> None:
-        for p, value in zip(self.blocks, self._split(values), strict=True):
+        entries = dict(zip(self.blocks, self._split(values), strict=True))
+        for p, value in entries.items():
+            if p.medium is not None and p.is_per_depth:
+                value = value * p.depth(entries[p.medium])
             p.value = value.detach().requires_grad_()
 
     def _split(self, vector: Tensor) -> list[Tensor]:

@@ -33,7 +33,7 @@ from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import differentiate, own_views, solve_tolerances
-from ddrecon.reconstruct.parameters import Parameter, face_stiffness
+from ddrecon.reconstruct.parameters import Knee, Parameter, by_coordinates, face_stiffness
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, kind_of
 from ddrecon.variables.values import with_values
@@ -71,7 +71,8 @@ def find_diagonals(point: Point, parameters: Sequence[Parameter]) -> dict[str, T
     squares = {p.name: torch.zeros_like(values[p.name]) for p in parameters}
     for _ in range(tuning.PROBES):
         leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
-        gradients = differentiate(point.scene, names, leaves, along, memory).gradients
+        bars = differentiate(point.scene, names, leaves, along, memory).gradients
+        gradients = by_coordinates(parameters, bars)
         for name, total in squares.items():
             total.add_(gradients[name].square(), alpha=1 / tuning.PROBES)
     return {p.name: _smooth(squares[p.name], 3 if p.is_field else 2) for p in parameters}
@@ -87,12 +88,15 @@ def _smooth(squares: Tensor, count: int) -> Tensor:
 def apply_metric(
     parameter: Parameter,
     value: Tensor,
+    knee: Knee,
     diagonal: Tensor,
     weight: float,
     free: Tensor,
     residuals: Tensor,
 ) -> Tensor:
     """The inverse metric of a field at `value`, of entries that are `free`, times `residuals`.
+
+    Its total variation has a `knee` there.
 
     With H the `diagonal` of the pictures' Gauss-Newton matrix, and the prior by its `weight`, the
     metric is H + S D^T V D S (E11.2), and so S (H / S^2 + D^T V D) S, the inside of which is an
@@ -101,7 +105,7 @@ def apply_metric(
     """
     grid, unit = parameter.grid, parameter.unit
     factor = weight * parameter.tv / unit**2
-    faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
+    faces, slope = face_stiffness(value / unit, grid, knee, factor)
     slope = torch.ones_like(value) if slope is None else slope
     z, y, x = map(_with_colors, faces)
     held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
@@ -22,10 +23,16 @@ KNEE = 1.2
 
 It is in optical depths across the box's shortest side, whatever the unit of density is.
 """
+GLOW, HAZE = 0.05, 0.1
+"""The knee of what glows beside a density, in brightnesses of the pictures for each optical depth,
+and the depth that empty space has there (E11.3). Measured on balls and a fire: at a knee of 0.15
+thin smoke glows evenly in place of smoke that is lit.
+"""
+Knee = float | Tensor | None
 AXES = (-3, -2, -1)
 
 
-def total_variation(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
+def total_variation(field: Tensor, grid: Grid, knee: Knee = None) -> Tensor:
     """The mean length of the gradient of `field` [..., z, y, x] over the cells of `grid`.
 
     The gradient is by position in units of the box's shortest side.
@@ -39,7 +46,7 @@ def total_variation(field: Tensor, grid: Grid, knee: float | None = None) -> Ten
 
 
 def face_stiffness(
-    field: Tensor, grid: Grid, knee: float | None = None, weight: float = 1.0
+    field: Tensor, grid: Grid, knee: Knee = None, weight: float = 1.0
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | None]:
     """R (E11.2) of `total_variation` at `field` [..., z, y, x], as D^T V D between S on both sides.
 
@@ -57,7 +64,7 @@ def face_stiffness(
     return (z, y, x), None if knee is None else (3 * (field + knee)).reciprocal_()
 
 
-def _find_length(field: Tensor, grid: Grid, knee: float | None) -> Tensor:
+def _find_length(field: Tensor, grid: Grid, knee: Knee) -> Tensor:
     """The length of the gradient of `field`, compressed where there is a `knee`, rounded at 0."""
     seen, times = (field, 1.0) if knee is None else (torch.log1p(field / knee), 1 / 3)
     square = torch.full_like(field, ROUNDING**2)
@@ -84,6 +91,9 @@ class Parameter:
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. `view` is the
     name of the view that it belongs to, None for what all views see. Its total variation is that of
     it in the `unit` of `unit_of`.
+
+    An emission beside a density that is sought, its `medium`, is smooth for each optical depth:
+    what has no mass hardly glows. `is_per_depth` says that the search moves it so as well.
     """
 
     def __init__(
@@ -107,17 +117,42 @@ class Parameter:
         self.unit, self.knee = unit, KNEE if kind.is_compressed else None
         self.start, self.value = value.detach(), value.clone().requires_grad_()
         self.support: Tensor | None = None
+        self.medium: Parameter | None = None
+        self.is_per_depth = False
 
-    def penalty(self) -> tuple[Tensor, Tensor] | None:
-        """What its total variation adds to the loss, and its derivative; None without.
+    def glow_in(self, medium: Parameter) -> None:
+        """Has it be smooth for each optical depth of `medium`."""
+        self.medium, self.knee = medium, GLOW
+
+    def depth(self, density: Tensor) -> Tensor:
+        """Optical depths [z, y, x] across the box, of a `density` of its medium, and haze."""
+        assert self.medium is not None
+        return density / self.medium.unit + HAZE
+
+    def knee_at(self, density: Tensor | None) -> Knee:
+        """The knee of what the search moves, where its medium has a `density`."""
+        if density is None or self.is_per_depth:
+            return self.knee
+        return GLOW * self.depth(density)
+
+    @property
+    def coordinate(self) -> Tensor:
+        """What the search moves: its value, or that for each optical depth."""
+        value = self.value.detach()
+        if self.medium is not None and self.is_per_depth:
+            value = value / self.depth(self.medium.value.detach())
+        return value
+
+    def penalty(self) -> Tensor:
+        """What its total variation adds to the loss, a function of its value and its medium's.
 
         It is relative to the mean square of the targets: brighter light or a wider frame change
         nothing. See `ParameterSettings` for its weight.
         """
-        if not self.tv:
-            return None
-        total = self.tv * total_variation(self.value / self.unit, self.grid, self.knee)
-        return total.detach(), torch.autograd.grad(total, self.value)[0]
+        source = self.value / self.unit
+        if self.medium is not None:
+            source = source / self.depth(self.medium.value)
+        return self.tv * total_variation(source, self.grid, self.knee)
 
     def project(self, value: Tensor) -> Tensor:
         """`value` within bounds and support; a direction as long as it is now."""
@@ -164,3 +199,18 @@ class Parameter:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
         self.value = (self.value.detach() * self.support).requires_grad_()
+
+
+def by_coordinates(
+    parameters: Iterable[Parameter], bars: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """The derivatives by what the search moves, of `bars`, those by values of `parameters`."""
+    turned = dict(bars)
+    for p in parameters:
+        if p.medium is not None and p.is_per_depth and p.name in bars:
+            depth = p.depth(p.medium.value.detach())
+            turned[p.name] = bars[p.name] * depth
+            # What is denser also glows more.
+            more = bars[p.name] * p.coordinate / p.medium.unit
+            turned[p.medium.name] = turned[p.medium.name] + more.view(-1, *depth.shape).sum(0)
+    return turned

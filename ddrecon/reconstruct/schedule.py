@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ddrecon.light.lights import AmbientLight
 from ddrecon.reconstruct import tuning
@@ -25,12 +25,14 @@ class Stage:
 
     A trial begins denser than the last stage ended, which it replaces where it explains the
     pictures better: what is lit alike from all around looks the same where it is thin and where it
-    is dark. Other lights tell.
+    is dark. Other lights tell. With `is_per_depth` the search moves what glows for each optical
+    depth of it: density then moves with its glow.
     """
 
     level: int
     waiting: frozenset[str] = frozenset()
     is_trial: bool = False
+    is_per_depth: bool = False
 
 
 @dataclass
@@ -66,7 +68,10 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
         has_trial = is_even and any(p.key == "density" for p in lit)
         trial = [Stage(stages[0].level, is_trial=True)] * has_trial
         # The metric of the first stage is that of nothing: what is there takes its own.
-        stages = [stages[0], *trial, *(stages[1:] or stages)]
+        if any(p.medium for p in fields):
+            stages[:1] = [stages[0], *trial, replace(stages[0], is_per_depth=True)]
+        else:
+            stages = [stages[0], *trial, *(stages[1:] or stages)]
     return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -196,6 +197,11 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         for name, start in starts.items()
     ]
     fields = [p for p in parameters if p.is_field]
+    densities = {p.name.removesuffix("density"): p for p in fields if p.key == "density"}
+    for p in fields:
+        medium = densities.get(p.name.removesuffix("emission"))
+        if p.key == "emission" and medium is not None and (p.low, p.high) == (0, math.inf):
+            p.glow_in(medium)
     if len(fields) == 1 and settings.parameters[fields[0].name].tv is None:
         fields[0].tv *= kind_of(fields[0].name).alone
     return parameters

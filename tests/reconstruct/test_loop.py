@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from media import random_values
 
 from ddrecon import load_scene
 from ddrecon.errors import DivergenceError, FormatError, SceneError, SolveError
@@ -17,6 +18,7 @@ from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.setup import scene_at_level
 from ddrecon.run.job import FORMAT, load_checkpoint
+from ddrecon.settings import ParameterSettings
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -224,3 +226,36 @@ def test_volumes_differ_and_numbers_do_not(still):
     assert [row.loss for row in again.advance()] == [row.loss for row in rows]
     for run, resumed in zip(together.frames, again.frames, strict=True):
         torch.testing.assert_close(values(resumed), values(run), rtol=0, atol=0)
+
+
+def test_the_search_sees_the_derivative_of_what_it_moves(ball_scene, monkeypatch):
+    """Of density and of what glows for each depth of it, in the stage that moves these."""
+    monkeypatch.setattr(tuning, "GRADIENT_ERROR", 1e-6)
+    shape = ball_scene.volume.grid.shape
+    sought = {name: ParameterSettings() for name in ("density", "emission")}
+    scene = replace(
+        ball_scene,
+        volume=replace(ball_scene.volume, emission=torch.zeros(1, *shape)),
+        diffusion=replace(ball_scene.diffusion, tolerance=1e-6),
+        optimize=replace(ball_scene.optimize, parameters=sought),
+    )
+    run = Reconstruction(scene)
+    (run.schedule.progress.stage,) = (
+        at for at, stage in enumerate(run.schedule.stages) if stage.is_per_depth
+    )
+    for p in run.parameters:
+        p.value = 0.3 * p.unit * random_values(*p.value.shape).float()
+    run._enter_stage()
+    values = run.search.values
+    move = 0.3 * values * random_values(*values.shape, seed=1).float()
+
+    def evaluate(step):
+        run.search.candidate = values + step * move
+        return run._add_up(run._evaluate_candidate())
+
+    ends, middle = [evaluate(step) for step in (-0.02, 0.02)], evaluate(0.0)
+    for change, slope in (
+        (ends[1].loss - ends[0].loss, middle.gradient),
+        (ends[1].prior - ends[0].prior, middle.prior_gradient),
+    ):
+        assert change / 0.04 == pytest.approx(float(slope @ move), rel=0.05)

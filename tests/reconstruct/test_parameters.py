@@ -9,7 +9,12 @@ from media import box_grid, make_scene, random_values
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import resample
-from ddrecon.reconstruct.parameters import Parameter, face_stiffness, total_variation
+from ddrecon.reconstruct.parameters import (
+    Parameter,
+    by_coordinates,
+    face_stiffness,
+    total_variation,
+)
 from ddrecon.settings import ParameterSettings
 
 GRID = box_grid((4, 6, 5))
@@ -96,6 +101,50 @@ def test_a_knee_compresses_densities_above_it():
     compressed = total_variation((1 + field / 0.1).log() / 3, grid)
     torch.testing.assert_close(total_variation(field, grid, 0.1), compressed)
     assert torch.autograd.gradcheck(lambda x: total_variation(x, grid, 0.1), field)
+
+
+def make_glow(density, emission, grid=GRID):
+    """An emission beside a density, in units of their own."""
+    medium = Parameter("density", ParameterSettings(tv=0.0), density, grid, unit=0.3)
+    glow = Parameter("emission", ParameterSettings(tv=1.0), emission, grid, unit=0.7)
+    glow.glow_in(medium)
+    return glow
+
+
+def cost(*fields):
+    return float(make_glow(*fields).penalty().detach())
+
+
+def test_an_emission_that_follows_its_medium_costs_nothing():
+    density = 1e4 * random_values(*GRID.shape)
+    assert cost(density, density) < 1e-4 * cost(density, density.flip(0))
+
+
+def test_what_has_no_mass_costs_more_where_it_glows():
+    """The same light, within smoke and beside it."""
+    density, light = torch.zeros(2, 8, 4, 4).double()
+    density[:4], light[1:3, 1:3, 1:3] = 3.0, 0.1
+    grid = box_grid((8, 4, 4))
+    assert cost(density, light.flip(0), grid) > 2 * cost(density, light, grid)
+
+
+def test_derivatives_for_each_optical_depth_are_those_of_the_same_function():
+    """By a density, what glows for each depth of it held, and by that: of colors in one medium."""
+    density, emission = random_values(*GRID.shape), random_values(3, *GRID.shape, seed=1)
+    glow = make_glow(density, emission)
+    glow.is_per_depth = True
+    names = glow.medium.name, glow.name
+
+    def value(density, source):
+        return (density.sin() * (source * glow.depth(density)).square()).sum()
+
+    coordinates = [x.clone().requires_grad_() for x in (density, glow.coordinate)]
+    torch.testing.assert_close(coordinates[1] * glow.depth(density), emission)
+    wanted = torch.autograd.grad(value(*coordinates), coordinates)
+    fields = [x.clone().requires_grad_() for x in (density, emission)]
+    bars = torch.autograd.grad((fields[0].sin() * fields[1].square()).sum(), fields)
+    turned = by_coordinates([glow, glow.medium], dict(zip(names, bars, strict=True)))
+    torch.testing.assert_close([turned[name] for name in names], list(wanted))
 
 
 def stiffness_matrix(field, grid, knee):

@@ -112,6 +112,19 @@ def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
     assert find_stages(3, scene, parameters) == [Stage(2)]
 
 
+def test_what_glows_beside_a_medium_moves_with_it_once(ball_scene):
+    """At the coarsest resolution, after all else there."""
+    grid, empty = ball_scene.volume.grid, torch.zeros(ball_scene.volume.grid.shape)
+    density, emission = (
+        Parameter(name, ParameterSettings(), empty, grid) for name in ("density", "emission")
+    )
+    emission.glow_in(density)
+    stages = find_stages(3, replace(ball_scene, lights=[]), [density, emission])
+    assert [stage.level for stage in stages if stage.is_per_depth] == [0]
+    assert [stage.level for stage in stages if not stage.is_per_depth][-2:] == [1, 2]
+    assert stages[-3].is_per_depth
+
+
 @pytest.mark.slow
 def test_a_run_rests_within_the_noise_that_is_known(coarse_ball):
     run = Reconstruction(coarse_ball, AUTO)

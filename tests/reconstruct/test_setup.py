@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from media import random_values
 
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
+from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import Problem, choose_loss, targets_of
 from ddrecon.settings import NoiseSettings, ParameterSettings
@@ -68,3 +70,23 @@ def test_photon_counts_errors_in_units_of_the_noise_that_is_given(ball_scene):
     (target,) = targets_of(problem.train, problem.loss, problem.noises).values()
     loss = float(target.loss_of(flat + 0.3))
     assert loss == pytest.approx(0.3**2 / (0.3**2 + 0.2 * 0.5), rel=1e-5)
+
+
+def test_smoothing_of_what_glows_also_moves_its_density(ball_scene):
+    """The prior's derivatives by both are its differences."""
+    volume = replace(ball_scene.volume, emission=torch.zeros(3, *ball_scene.volume.grid.shape))
+    sought = {name: ParameterSettings() for name in ("density", "emission")}
+    settings = replace(ball_scene.optimize, parameters=sought)
+    frame = Frame(replace(ball_scene, volume=volume, optimize=settings), None)
+    frame.enter(0)
+    starts = {p: random_values(*p.value.shape).float() * p.unit for p in frame.parameters}
+
+    def evaluate(moved, step):
+        for p, start in starts.items():
+            p.value = (start + step * start.flip(-1) * (p is moved)).requires_grad_()
+        return frame.evaluate()
+
+    for p, start in starts.items():
+        slope = float((evaluate(p, 0.0).prior_gradients[p.name] * start.flip(-1)).sum())
+        change = evaluate(p, 2e-3).prior - evaluate(p, -2e-3).prior
+        assert change / 4e-3 == pytest.approx(slope, rel=0.01)
