@@ -32,14 +32,20 @@ def sweep_fused(
 ) -> Tensor:
     """As `_sweep_emitted` of `transport/sweep.py`."""
     fields = extinction, emitted, gradient
-    if not (emitted.is_cuda or grid.periodic or mirror):
-        return sweep_ordinates((grid, directions, None), fields)[0]
+    by_rows = not (emitted.is_cuda or 0 in grid.periodic or mirror)
+    moments = torch.zeros_like(emitted)
+    if by_rows:
+        moments = sweep_ordinates((grid, directions, None), fields)[0]
+        if not grid.periodic:
+            return moments
     tables = ordinate_tables(grid, directions, emitted, len(emitted))
     points, *_ = sweep_rule(directions, 1)
-    moments, gone = torch.zeros_like(emitted), dict[int, Ends]()
+    gone = dict[int, Ends]()
     # Light of a single chunk is kept for the way back; of several, one at a time is there.
     run = _sweep_chunk if len(tables.chunks) == 1 else functools.partial(recompute, _sweep_chunk)
     for number, chunk in enumerate(tables.chunks):
+        if by_rows and not chunk.stays:
+            continue
         numbers = tables.numbers[chunk.ordinates]
         courses = [Characteristic.of(grid, points[n]) for n in numbers]
         ends = None if mirror is None else [mirror.entering(n) for n in numbers]

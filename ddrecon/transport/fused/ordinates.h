@@ -1,5 +1,6 @@
 #pragma once
 #include "ddrecon/kernels/dual.h"
+#include "ddrecon/transport/fused/attenuation.h"
 // Radiance along discrete ordinates, and its moments (E2.9, E2.8).
 //
 // A cell takes light from up to four cells of the slice upwind, across the axis along which an
@@ -10,10 +11,12 @@
 // ordinates that do, and down with the others. Whatever the slices of an ordinate are, across z or
 // y, cells upwind were done before; across x, what comes from cells of the same row is carried on
 // from cell to cell. Other loops over the cells of a row are vector code, and sums over ordinates
-// are formed row by row.
+// are formed row by row. What leaves by a face across y or x of a periodic grid enters by the
+// opposite one: along x in closed form, and along y by laps through the rows of a plane, since
+// light that leaves planes is gone after some. Ordinates within planes are swept by cells.
 //
-// By cells, for a GPU, and where light enters by faces or goes around: an item is a cell of a
-// slice, for one ordinate and color. A launch does one slice of every ordinate. What moments are
+// By cells, for a GPU, and where light enters by faces or stays between them: an item is a cell of
+// a slice, for one ordinate and color. A launch does one slice of every ordinate. What moments are
 // along ordinates is known before, and what ordinates give is summed later: as products of
 // matrices. What leaves by a face of a periodic grid enters by the opposite one.
 
@@ -26,55 +29,16 @@
 
 namespace ddrecon {
 
-// phi, psi and eta of `numerics/decay.py` for an optical depth, the slope of eta, and exp(-depth).
-template <class F> struct Decay {
-    F phi, psi, eta, eta_slope, passed;
-};
-template <class F> INLINE Decay<F> decay_along(F depth) {
-    const F passed = decay(depth);
-    const bool is_thin = depth < F(0.5);
-    const auto [phi, psi, eta] = decayed(depth, passed, is_thin);
-    const F near_slope = eta_slope_series(is_thin ? depth : F(0));
-    const F slope = (F(0.5) * (phi - psi) - F(3) * eta) / (is_thin ? F(0.5) : depth);
-    return {phi, psi, eta, is_thin ? near_slope : slope, passed};
-}
-// The same with depth eta as `rising`, and slopes where the depth is a dual number.
-template <class N> struct Attenuation {
-    N phi, psi, eta, rising, passed;
-};
-template <class F, class N> INLINE Attenuation<N> attenuate(const Decay<F>& by, const N& depth) {
-    const F d = value_of(depth);
-    return {
-        along(depth, Sloped<F>{by.phi, by.psi - by.phi}),
-        along(depth, Sloped<F>{by.psi, F(-2) * by.eta}),
-        along(depth, Sloped<F>{by.eta, by.eta_slope}),
-        along(depth, Sloped<F>{d * by.eta, by.eta + d * by.eta_slope}),
-        along(depth, Sloped<F>{by.passed, -by.passed})};
-}
-
-// What a cell emits along the path: its sum, and by how much more at the end than at the beginning.
-template <class N> struct Emitted {
-    N sum, rise;
-};
-// I where light leaves the cell, and its mean along the path.
-template <class N, class E, class D>
-INLINE D light_after(const N& arriving, const Emitted<E>& emitted, const Attenuation<D>& by) {
-    return arriving * by.passed + (emitted.sum * by.phi + emitted.rise * by.rising);
-}
-template <class N, class E, class D>
-INLINE D light_within(const N& arriving, const Emitted<E>& emitted, const Attenuation<D>& by) {
-    return arriving * by.phi + (emitted.sum * by.psi - emitted.rise * by.eta);
-}
-
 // Ordinates from `begin` on; those from `middle` to `end` go down in y. `sense` along z: 1 or -1.
+// From `around` [up, down] on they go around along y.
 struct Team {
-    int begin, middle, end, sense;
+    int begin, middle, end, sense, around[2];
 };
 // An ordinate: the axis across which its slices lie, its senses along z, y and x, and how many
 // points upwind it takes light from: one or four, each so many cells upwind along z and so far
-// along y and x.
+// along y and x; and laps around along y.
 struct Ordinate {
-    int axis, senses[3], count, back[4], shifts[4];
+    int axis, senses[3], count, back[4], shifts[4], laps;
 };
 // The path through a cell [u], cells moved along z, y, x on it times that, and weights of points.
 template <class F> struct Path {
@@ -151,6 +115,9 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     // By cells a third output is the cotangent of extinction.
     enum { EMITTED, CHANGE, MEAN_BAR = 1, MEAN = 0, SUM_BAR = 0, RISE_BAR, EXTINCTION_BAR };
     static constexpr int CELL = ROWS + 2;
+    // What goes around along a row is followed for 2^DOUBLINGS periods.
+    static constexpr int DOUBLINGS = 10;
+    static constexpr F ROUNDING = sizeof(F) == 4 ? F(1.1920929e-7) : F(2.220446049250313e-16);
     // Numbers in a line of a cache.
     static constexpr int LINE = 64 / sizeof(F);
     // Where a row of cells, or a cell, begins: among cells, and among numbers in rings, in its
@@ -326,21 +293,83 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     }
 
     // Follows light through the cells, for its moments or for itself alone; or returns cotangents.
-    enum Pass { MOMENTS, LIGHT, BACK };
+    // RETURN is for cotangents of what enters cells alone.
+    enum Pass { MOMENTS, LIGHT, BACK, RETURN };
     template <Pass PASS> static constexpr bool HAS_SLOPES = PASS == BACK || IS_DUAL<N>;
     template <Pass PASS> INLINE void run() const {
         if constexpr (BY_CELLS)
             run_cell<PASS>(team.begin);
         else
-            for (int s = of.begin; s < of.end; ++s)
-                for (int t = 0; t < 2 * of.height; ++t) {
-                    const bool goes_up = t < of.height, is_back = PASS == BACK;
-                    const int begin = goes_up ? team.begin : team.middle;
-                    const int end = goes_up ? team.middle : team.end, y = t % of.height;
-                    const int at = goes_up != is_back ? y : of.height - 1 - y;
-                    const int plane = is_back ? of.end - 1 - (s - of.begin) : s;
-                    if (begin < end) run_row<PASS>(row(plane, at), goes_up != is_back, begin, end);
-                }
+            for (int s = of.begin; s < of.end; ++s) {
+                const bool is_back = PASS == BACK;
+                const int plane = is_back ? of.end - 1 - (s - of.begin) : s;
+                run_plane<PASS>(plane, !is_back, team.begin, team.around[0], team.middle);
+                run_plane<PASS>(plane, is_back, team.middle, team.around[1], team.end);
+            }
+    }
+    template <Pass PASS>
+    INLINE void run_plane(int plane, bool is_up, int begin, int around, int end) const {
+        if (around < end) go_around<PASS == BACK ? RETURN : LIGHT>(plane, is_up, around, end);
+        run_rows<PASS>(plane, is_up, begin, end);
+        if (of.periodic & 2)
+            for (int j = begin; j < end; ++j) {
+                wrap_rows(plane_of<PASS>(plane, j), true);
+                wrap_rows(plane_of<PASS>(plane, j), false);
+            }
+    }
+    template <Pass PASS> INLINE void run_rows(int plane, bool is_up, int begin, int end) const {
+        if (begin == end) return;
+        for (int y = 0; y < of.height; ++y)
+            run_row<PASS>(row(plane, is_up ? y : of.height - 1 - y), is_up, begin, end);
+    }
+    // A plane of the ring that a pass writes.
+    template <Pass PASS> INLINE F* plane_of(int plane, int j) const {
+        const Row first = row(plane, 0);
+        return PASS == BACK || PASS == RETURN
+                   ? ring(of.returning, of.back_planes, j) + first.returning[0]
+                   : ring(of.light, of.planes, j) + first.light[0];
+    }
+    // Finds what enters a plane along y after periods, of ordinates whose light comes from cells of
+    // the same plane: laps begin with nothing, and end by their number or where nothing changes.
+    template <Pass PASS> APART void go_around(int plane, bool is_up, int begin, int end) const {
+        int laps = 0;
+        for (int j = begin; j < end; ++j) {
+            F* const rim = plane_of<PASS>(plane, j) + (is_up ? -1 : of.height) * row_size - 1;
+            for (int k = 0; k < KINDS; ++k)
+                for (int c = 0; c < row_size; ++c) rim[k * plane_size + c] = F(0);
+            laps = ordinate(j).laps > laps ? ordinate(j).laps : laps;
+        }
+        bool changes = true;
+        for (int lap = 0; lap < laps && changes; ++lap) {
+            run_rows<PASS>(plane, is_up, begin, end);
+            changes = false;
+            for (int j = begin; j < end; ++j) changes |= wrap_rows(plane_of<PASS>(plane, j), is_up);
+        }
+    }
+    // Copies the ends of a row, where the grid is periodic along it, to beyond the opposite ones.
+    INLINE void wrap_columns(F* row) const {
+        if (BY_CELLS || !(of.periodic & 4)) return;
+        for (int k = 0; k < KINDS; ++k, row += plane_size)
+            row[-1] = row[width - 1], row[width] = row[0];
+    }
+    // Copies the last row of a plane to before the first, and says whether that changes it.
+    INLINE bool wrap_rows(F* plane, bool is_up) const {
+        const long long last = (is_up ? of.height - 1 : 0) * row_size - 1;
+        const long long rim = (is_up ? -1 : of.height) * row_size - 1;
+        bool changes = false;
+        for (int k = 0; k < KINDS; ++k, plane += plane_size) {
+            F change = F(0), size = F(0);
+            for (int c = 0; c < row_size; ++c) {
+                const F before = plane[rim + c], after = plane[last + c];
+                const F moved = after < before ? before - after : after - before;
+                const F length = after < F(0) ? -after : after;
+                change = moved > change ? moved : change;
+                size = length > size ? length : size;
+                plane[rim + c] = after;
+            }
+            changes |= change > ROUNDING * size;
+        }
+        return changes;
     }
     // Rows of `count` numbers of each cell, asked for before they are needed. Not long before: so
     // far apart, they take each other's places in a cache.
@@ -351,10 +380,10 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     template <Pass PASS> INLINE void run_row(const Row& row, bool is_up, int begin, int end) const {
         const long long at = color * cells + row.at, next = at + (is_up ? width : -width);
         prefetch(of.extinction + at, 1);
-        prefetch(of.gradient + at, 3);
+        if (PASS != RETURN) prefetch(of.gradient + at, 3);
         sum_sources<PASS>(row, begin, end);
-        prefetch(of.source + next, of.count);
-        if (PASS != LIGHT) prefetch(sum_of(of.sums, of.count, row), of.count);
+        if (PASS != RETURN) prefetch(of.source + next, of.count);
+        if (PASS == MOMENTS || PASS == BACK) prefetch(sum_of(of.sums, of.count, row), of.count);
         if (PASS == BACK) {
             prefetch(of.bars + next, of.count);
             prefetch(sum_of(of.gradient_bar, 3, row), 3);
@@ -397,26 +426,34 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         if (PASS == BACK) repeat(ring(of.returning, of.planes, j), axis, place, row);
     }
     template <Pass PASS> INLINE void sum_sources(const Row& row, int begin, int end) const {
-        sum_moments(EMITTED, of.source, of.values, row, begin, end);
+        constexpr bool IS_BACK = PASS == BACK || PASS == RETURN;
+        if constexpr (PASS != RETURN) sum_moments(EMITTED, of.source, of.values, row, begin, end);
         if constexpr (IS_DUAL<N>) sum_moments(CHANGE, of.d_source, of.values, row, begin, end);
-        if constexpr (PASS == BACK) sum_moments(MEAN_BAR, of.bars, of.weighted, row, begin, end);
+        if constexpr (IS_BACK) sum_moments(MEAN_BAR, of.bars, of.weighted, row, begin, end);
     }
     template <Pass PASS> INLINE void run_ordinate(const Row& row, int j) const {
         const bool is_along = !BY_CELLS && ordinate(j).axis == 2,
                    is_single = ordinate(j).count == 1;
-        if constexpr (PASS == BACK) {
+        if constexpr (PASS == RETURN) {
+            is_single ? return_light<1>(row, j) : return_light<4>(row, j);
+        } else if constexpr (PASS == BACK) {
             if (is_along)
-                return_along(row, j), return_row<false, 4>(row, j);
+                return_light<4>(row, j), return_row<false, 4>(row, j);
             else
                 is_single ? return_row<true, 1>(row, j) : return_row<true, 4>(row, j);
+            wrap_columns(ring(of.returning, of.back_planes, j) + row.returning[0]);
         } else {
             constexpr Result RESULT = PASS == LIGHT ? AFTER : BOTH;
-            if (!is_along)
-                return is_single ? follow_row<RESULT, 1>(row, j) : follow_row<RESULT, 4>(row, j);
-            follow_row<ALONG, 4>(row, j);
             F* const to = ring(of.light, of.planes, j) + row.light[0];
-            carry_on<N>(to, to + plane_size, ordinate(j).senses[2]);
-            if constexpr (PASS == MOMENTS) follow_row<WITHIN, 4>(row, j);
+            if (is_along) {
+                follow_row<ALONG, 4>(row, j);
+                carry_on<N>(to, to + plane_size, ordinate(j).senses[2]);
+            } else {
+                is_single ? follow_row<RESULT, 1>(row, j) : follow_row<RESULT, 4>(row, j);
+            }
+            wrap_columns(to);
+            if constexpr (PASS == MOMENTS)
+                if (is_along) follow_row<WITHIN, 4>(row, j);
         }
     }
 
@@ -463,6 +500,15 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         const F* const carried = scratch + CARRIED * pitch;
         const auto local = readable<M>(to, d_to), by = readable<M>(carried, carried + pitch);
         M x = F(0);
+        if (of.periodic & 4) {
+            M share = F(1);
+            for (int t = 0; t < width; ++t) {
+                const int c = sense > 0 ? t : width - 1 - t;
+                x = local[c] + by[c] * x;
+                share = share * by[c];
+            }
+            for (int n = 0; n < DOUBLINGS; ++n) x = x + share * x, share = share * share;
+        }
         for (int t = 0; t < width; ++t) {
             const int c = sense > 0 ? t : width - 1 - t;
             x = local[c] + by[c] * x;
@@ -471,13 +517,14 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         }
     }
 
-    // Cotangents of what enters the cells of a row, gathered from cells downwind, where these lie
-    // along the row itself.
-    APART void return_along(const Row& row, int j) const {
+    // Cotangents of what enters the cells of a row, gathered from cells downwind; some may lie in
+    // the row itself.
+    template <int POINTS> APART void return_light(const Row& row, int j) const {
         F* const returning = ring(of.returning, of.back_planes, j);
-        auto downwind = neighbors<4>(returning, row.returning, 1, j);
+        auto downwind = neighbors<POINTS>(returning, row.returning, 1, j);
         const F along = downwind.weights[0], *const bar = ordinate_row(MEAN_BAR, j);
-        downwind.weights[0] = F(0);
+        const bool is_along = ordinate(j).axis == 2;
+        if (is_along) downwind.weights[0] = F(0);
         F *const to = returning + row.returning[0], *const decays = scratch;
         const long long pitch = this->pitch;
         const int width = BY_CELLS ? 1 : this->width;
@@ -487,9 +534,10 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
             decays[CARRIED * pitch + c] = along * passed;
             to[c] = downwind(c) * passed + bar[c] * decays[PHI * pitch + c];
         }
-        carry_on<F>(to, to, -ordinate(j).senses[2]);
+        if (is_along) carry_on<F>(to, to, -ordinate(j).senses[2]);
+        wrap_columns(to);
     }
-    // The adjoint of `follow_row`; it IS_RETURNING if `return_along` has not.
+    // The adjoint of `follow_row`; it IS_RETURNING if `return_light` has not.
     template <bool IS_RETURNING, int POINTS> APART void return_row(const Row& row, int j) const {
         const Path<F> path = this->path(j);
         const F *const source = ordinate_row(EMITTED, j), *const bar = ordinate_row(MEAN_BAR, j);

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.transport.characteristics import Characteristic, Direction
+from ddrecon.transport.characteristics import DOUBLINGS, Characteristic, Direction
 from ddrecon.transport.sweep import sweep_rule
 
 POINTS = 4
@@ -28,12 +28,16 @@ on a processor few, since arrays of a chunk have all its slices.
 
 @dataclass(frozen=True)
 class Chunk:
-    """Ordinates swept side by side: from `first` on, `count` of them, in teams from `team` on."""
+    """Ordinates swept side by side: from `first` on, `count` of them, in teams from `team` on.
+
+    By cells all or none of them stay (`Ordinate.stays`).
+    """
 
     first: int
     count: int
     team: int
     teams: int
+    stays: bool
 
     @property
     def ordinates(self) -> slice:
@@ -45,7 +49,7 @@ class Chunk:
 class Tables:
     """Ordinates in the order of kernels: `numbers` in the quadrature set, and what kernels get.
 
-    `chunks` are swept one after another. `arrays`: `teams` [T, 4] and `ordinates` [N, 13] have the
+    `chunks` are swept one after another. `arrays`: `teams` [T, 6] and `ordinates` [N, 14] have the
     structs `Team` and `Ordinate` of `ordinates.h`, `paths` [N, 8] the struct `Path`; `values` and
     `weighted` [N, K] are harmonics times the path through a cell, and times quadrature weights;
     `moved` [N, 3] is a part of `paths`.
@@ -64,7 +68,9 @@ class Ordinate:
     `axis`: that across which its slices lie; `step` [u]: its path through a cell; `moved`: cells
     that it passes along z, y and x meanwhile, with signs. Light comes from four `points`, so many
     cells away, against its senses, with `weights`: the largest first, but across x the point in the
-    same row.
+    same row. `laps`: in how many laps through the rows of a plane all that goes around along y has
+    come, but for rounding; 0 where it comes from the plane before. It `stays` if it moves along no
+    axis where the box ends.
     """
 
     number: int
@@ -73,9 +79,11 @@ class Ordinate:
     moved: tuple[float, ...]
     points: list[tuple[int, ...]]
     weights: list[float]
+    laps: int
+    stays: bool
 
     @staticmethod
-    def of(grid: Grid, number: int, direction: Direction) -> Ordinate:
+    def of(grid: Grid, number: int, direction: Direction, rounding: float) -> Ordinate:
         """The ordinate of a `direction` through `grid` (E2.9)."""
         course = Characteristic.of(grid, direction)
         axis, moved = course.order[0] - 1, course.moved
@@ -89,7 +97,13 @@ class Ordinate:
         weights = [weight(point) for point in points]
         # Equal paths share decay terms: mirror images have equal ones but for rounding.
         step = float(f"{course.step:.14g}")
-        return Ordinate(number, axis, step, tuple(moved), points, weights)
+        stays = not any(m for a, m in enumerate(moved) if a not in grid.periodic)
+        laps = 0
+        if axis > 0 and moved[1] and not stays and 1 in grid.periodic:
+            # In every row a part of light leaves for the next plane.
+            lost = -math.log(max(1 - abs(moved[0]), rounding)) * grid.shape[1]
+            laps = min(math.ceil(-math.log(rounding) / max(lost, 1e-9)), 2**DOUBLINGS)
+        return Ordinate(number, axis, step, tuple(moved), points, weights, laps, stays)
 
     @property
     def senses(self) -> list[int]:
@@ -107,7 +121,7 @@ class Ordinate:
         count = 1 if self.axis < 2 and self.weights[1] == 0 else POINTS
         backs = [back for back, _, _ in self.points]
         shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
-        return [self.axis, *self.senses, count, *backs, *shifts]
+        return [self.axis, *self.senses, count, *backs, *shifts, self.laps]
 
     def numbers(self) -> list[float]:
         """The struct `Path`."""
@@ -133,7 +147,7 @@ def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[Team]:
             turns = {turn: [o for o in way[n::count] if o.turn == turn] for turn in (1, -1, 0)}
             # Those that can do either turn with the others, so that rows are read once.
             turns[1 if len(turns[1]) >= len(turns[-1]) else -1] += turns[0]
-            up, down = (sorted(turns[turn], key=lambda o: o.step) for turn in (1, -1))
+            up, down = (sorted(turns[turn], key=lambda o: (o.laps > 0, o.step)) for turn in (1, -1))
             teams.append(Team(sense, up, down))
     return teams
 
@@ -173,26 +187,31 @@ def _make_tables(
     device: torch.device,
 ) -> Tables:
     """The same, of chunks of about so many teams `together`."""
-    points, weights, harmonics = sweep_rule(directions, moments)
-    ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
-    if pieces is None:
-        # Those that go around are followed again and again, fewer times where light keeps to whole
-        # cells: they are in chunks of their own.
-        def kind(o: Ordinate) -> int:
-            return (o.axis in grid.periodic) * (1 + any(moved % 1 for moved in o.moved))
 
-        teams = [(kind(o), Team(o.senses[0], [o], [])) for o in ordinates]
-        groups = [[team for number, team in teams if number == n] for n in range(3)]
+    def kind(o: Ordinate) -> int:
+        return (o.axis in grid.periodic) + o.stays
+
+    points, weights, harmonics = sweep_rule(directions, moments)
+    rounding = torch.finfo(dtype).eps
+    ordinates = [Ordinate.of(grid, number, point, rounding) for number, point in enumerate(points)]
+    if pieces is None:
+        # Those that go around are followed again and again, and those that stay most often: they
+        # are in chunks of their own.
+        kinds = [[o for o in ordinates if kind(o) == n] for n in range(3)]
+        groups = [[Team(o.senses[0], [o], []) for o in several] for several in kinds]
     else:
-        groups = [_team_rows(ordinates, pieces)]
+        groups = [_team_rows([o for o in ordinates if not o.stays], pieces)]
     order, rows, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
     for several in (several for teams in groups for several in _share_out(teams, together)):
         first = len(order)
         for team in several:
             begin, middle = len(order), len(order) + len(team.up)
             order += team.up + team.down
-            rows.append([begin, middle, len(order), team.sense])
-        chunks.append(Chunk(first, len(order) - first, len(rows) - len(several), len(several)))
+            direct = (sum(not o.laps for o in way) for way in (team.up, team.down))
+            around = [place + n for place, n in zip((begin, middle), direct, strict=True)]
+            rows.append([begin, middle, len(order), team.sense, *around])
+        count, teams = len(order) - first, len(several)
+        chunks.append(Chunk(first, count, len(rows) - teams, teams, order[first].stays))
     numbers = [o.number for o in order]
     paths = torch.tensor([o.numbers() for o in order], dtype=torch.float64)
     values, set_weights = harmonics[numbers], harmonics.new_tensor(weights)[numbers, None]
@@ -207,5 +226,5 @@ def _make_tables(
         name: torch.tensor(table, dtype=torch.int32, device=device)
         for name, table in integers.items()
     } | {name: table.to(device, dtype) for name, table in tables.items()}
-    team_size = max(end - begin for begin, _, end, _ in rows)
+    team_size = max(end - begin for begin, _, end, *_ in rows)
     return Tables(numbers, chunks, arrays, team_size)
