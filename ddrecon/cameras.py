@@ -200,10 +200,25 @@ def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
-    """Centers (row, column) of `samples` equal parts of a pixel, as squarely as that divides."""
-    rows = max(n for n in range(1, math.isqrt(samples) + 1) if samples % n == 0)
-    columns = samples // rows
-    return [((i + 0.5) / rows, (j + 0.5) / columns) for i in range(rows) for j in range(columns)]
+    """Places (row, column) of `samples` rays in a pixel, spread evenly over its area.
+
+    No two share a row or a column: where pixels fit cells of a volume, rays of a regular grid would
+    all see the same places of cells. They are a lattice of rank 1 but for its origin, whose places
+    lie as far apart as may be (Niederreiter 1992, doi:10.1137/1.9781611970081, chapter 5).
+    """
+    size = samples + 1
+    rows = torch.arange(1, size)
+
+    def columns_of(step: int) -> Tensor:
+        return rows * step % size
+
+    def apart(step: int) -> int:
+        sides = torch.stack([rows, columns_of(step)])
+        return int((torch.minimum(sides, size - sides) ** 2).sum(0).amin())
+
+    step = max((n for n in range(1, size) if math.gcd(n, size) == 1), key=apart)
+    places = (torch.stack([rows, columns_of(step)], 1).double() - 0.5) / samples
+    return [(row, column) for row, column in places.tolist()]
 
 
 def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:

@@ -116,15 +116,21 @@ def test_a_pixel_is_as_wide_as_the_way_to_the_next_one(is_perspective):
 
 
 @given(st.integers(1, 64))
-def test_samples_are_centers_of_equal_parts(samples):
+def test_samples_share_no_row_and_no_column(samples):
     offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
-    assert len({(round(a, 9), round(b, 9)) for a, b in offsets.tolist()}) == samples
-    assert offsets.mean(0).tolist() == pytest.approx([0.5, 0.5], abs=1e-14)
-    rows, columns = (len(set(line.tolist())) for line in offsets.unbind(1))
-    assert rows * columns == samples
-    second_moments = ((offsets - 0.5) ** 2).mean(0)
-    expected = [(1 - 1 / count**2) / 12 for count in (rows, columns)]
-    assert second_moments.tolist() == pytest.approx(expected, abs=1e-14)
+    centers = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples
+    for places in offsets.unbind(1):
+        torch.testing.assert_close(places.sort().values, centers)
+
+
+@pytest.mark.parametrize("samples", (4, 16, 64, 100, 1024))
+def test_samples_cover_a_pixel_evenly(samples):
+    """No empty disk, around the pixel's edges, is much larger than that of a square grid."""
+    offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
+    probes = torch.rand(500, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    away = (probes[:, None] - offsets).abs()
+    nearest = torch.minimum(away, 1 - away).norm(dim=-1).amin(1)
+    assert nearest.max() < 1.25 * (0.5 / samples) ** 0.5
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
