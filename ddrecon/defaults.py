@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
-from ddrecon.march.samplers import greatest_depth
+from ddrecon.march.samplers import greatest_depth, mean_side
 from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.settings import DiffusionSettings
 
@@ -28,6 +28,9 @@ FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
 (`FINER_FLAT` in a flat medium), unless that makes more than `MOST_CELLS` cells. Measured on blocks,
 half-spaces and merged balls (docs/accuracy.md). If it does, axes stay undivided along which nothing
 varies and the box is `LONG` times as long as along another, up to three numbers for each cell."""
+WIDE = 2.0
+"""Sweeps go through halves of cells along axes along which these have more than `FINER` optical
+depths still and are so many times as wide as along another (E2.18)."""
 PARTS = 3
 """Cells that stay thick receive the light of suns in parts so many times as narrow (E5.10)."""
 SOFT = 3.0
@@ -53,7 +56,7 @@ def choose_diffusion(
     at least. The thickest cell and dense faces count where density is not optimized.
     """
     choices = settings.transport_rounds, settings.degree, settings.refine, settings.receive
-    left_out = None in choices
+    left_out = None in (*choices, settings.halve_along)
     if not settings.rounds or not left_out:
         return settings, ""
     left = float(volume.phase.moments(3)[:, 2].abs().max())
@@ -72,14 +75,14 @@ def choose_diffusion(
     if settings.transport_tolerance is not None:
         rounds = MOST_ROUNDS
     receive = PARTS if depth / times > thin else 1
-    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times, "receive": receive}
-    added: dict[str, Any] = {
-        key: value for key, value in chosen.items() if getattr(settings, key) is None
-    }
+    chosen: dict[str, Any] = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    chosen |= {"receive": receive, "halve_along": _choose_halves(volume, depth, times, along)}
+    added = {key: value for key, value in chosen.items() if getattr(settings, key) is None}
     if settings.refine is None and times > 1 and along != settings.refine_along:
         reasons.append("too many cells to divide all")
         added["refine_along"] = along
-    words = ", ".join(f"{k} {value}" for k, value in added.items() if (k, value) != ("receive", 1))
+    plain = ("receive", 1), ("halve_along", "none")
+    words = ", ".join(f"{k} {value}" for k, value in added.items() if (k, value) not in plain)
     return replace(settings, **added), f"{words}: {', '.join(reasons)}"
 
 
@@ -99,6 +102,23 @@ def _choose_cells(
             break
         times *= 3
     return times, along
+
+
+def _choose_halves(volume: Volume, depth: float, times: int, along: str) -> str:
+    """The axes along which sweeps go through halves of cells, as of `choose_diffusion`.
+
+    Across its mean side a cell of `volume` has so many optical depths at most; along these axes it
+    is divided by `times`.
+    """
+    finer, mean = volume.grid.refine(times, along), mean_side(volume.grid)
+    sides = zip("zyx", finer.shape, finer.spacing, strict=True)
+    axes = "".join(
+        axis
+        for axis, cells, side in reversed([*sides])
+        if cells > 1 and side > WIDE * min(finer.spacing) and depth * side > FINER * mean
+    )
+    fits = volume.index == 1 and finer.refine(2, axes).cells <= 4 * MOST_CELLS
+    return axes if axes and fits else "none"
 
 
 def _choose_rounds(

@@ -143,6 +143,7 @@ def find_light(
     """
     is_diffuse = multiply_scatters(medium, settings)
     medium = refine_medium(medium, settings.times, settings.refine_along)
+    medium = replace(medium, halved=settings.halved)
     # The paper's own scheme knows values at centers only.
     cells = medium if settings.scheme == "printed" else average_cells(medium)
     # Light not yet scattered that is no beam: of a ground, and of beams that faces reflect (E5.8).

@@ -42,6 +42,9 @@ class RenderSettings:
         return self.steps_per_voxel or 1
 
 
+ALONG = "x", "y", "z", "xy", "xz", "yz", "xyz"
+
+
 @dataclass(frozen=True)
 class DiffusionSettings:
     """How light that is scattered more than once is found. [Settings](settings.md) says how to
@@ -61,6 +64,8 @@ class DiffusionSettings:
         single round 18 for 1, 26 for 3. Left out: by the medium.
     refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
     refine_along: The axes along which cells are divided.
+    halve_along: The axes along which sweeps go through halves of cells, or `none`. Left out: by the
+        medium.
     receive: How many times narrower still cells are that receive light of suns. Left out: by the
         medium.
     """
@@ -74,7 +79,8 @@ class DiffusionSettings:
     transport_tolerance: float | None = bounded(None, above=0, below=1)
     degree: int | None = one_of(None, (1, 3, 5, 7))
     refine: int | None = one_of(None, (1, 3, 9), expert=True)
-    refine_along: str = one_of("xyz", ("x", "y", "z", "xy", "xz", "yz", "xyz"), expert=True)
+    refine_along: str = one_of("xyz", ALONG, expert=True)
+    halve_along: str | None = one_of(None, ("none", *ALONG), expert=True)
     receive: int | None = one_of(None, (1, 3), expert=True)
 
     @property
@@ -98,6 +104,11 @@ class DiffusionSettings:
     def times(self) -> int:
         """How many times as narrow as the medium's the cells of light are."""
         return self.refine or 1
+
+    @property
+    def halved(self) -> str:
+        """The axes along which sweeps go through halves of cells, none of them ""."""
+        return "" if self.halve_along in (None, "none") else str(self.halve_along)
 
     def violations(self) -> Iterator[Violation]:
         if self.model == "flux_limited" and self.scheme == "printed":

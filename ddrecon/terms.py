@@ -157,6 +157,8 @@ def _round_terms(medium: Medium, scene: Scene) -> Iterator[str]:
         along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
         cells = " x ".join(map(str, reversed(finer.shape)))
         yield f"light in {cells} cells, {settings.times} times as narrow{along}"
+    if settings.halved:
+        yield f"sweeps through halves of cells along {settings.halved}"
     if (settings.receive or 1) > 1:
         yield f"light of suns in {settings.receive}^3 parts of each cell"
     if scene.reason:

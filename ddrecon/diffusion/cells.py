@@ -4,11 +4,15 @@ View rays and beams see fields that are linear between cells' centers. Energy is
 light is computed in a medium of cells' means, and what it is there is the mean of what is seen.
 """
 
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
+from ddrecon.medium.coefficients import Medium, for_channels, mean_width, resample, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import second_difference
 from ddrecon.numerics.layout import apply_around
@@ -20,9 +24,23 @@ THIN = 1.5
 def average_cells(medium: Medium) -> Medium:
     """`medium` with cells' means of fields that are linear between their centers.
 
-    Beyond the outermost centers they stay as they are there.
+    Beyond the outermost centers they stay as they are there. So it is in the `parts` of cells that
+    are `halved`, a half of which is even along its axis about the middle.
     """
-    return medium.mapped(lambda field: apply_around(average, field, medium.grid), "emission")
+    grid, cells = (
+        medium.grid,
+        medium.mapped(lambda field: apply_around(average, field, medium.grid), "emission"),
+    )
+    if not medium.halved:
+        return cells
+    finer = grid.refine(2, medium.halved)
+    whole = [axis for axis in AXES if finer.shape[axis - 1] == grid.shape[axis - 1]]
+
+    def halve(field: Tensor) -> Tensor:
+        averaged = apply_around(functools.partial(_average_along, axes=whole), field, grid)
+        return resample(averaged, finer)
+
+    return replace(cells, parts=medium.put(finer, halve))
 
 
 def average(field: Tensor) -> Tensor:
@@ -31,7 +49,11 @@ def average(field: Tensor) -> Tensor:
         from ddrecon.diffusion.fused.cells import average_fused
 
         return average_fused(field)
-    for axis in AXES:
+    return _average_along(field, AXES)
+
+
+def _average_along(field: Tensor, axes: Sequence[int]) -> Tensor:
+    for axis in axes:
         field = field + recompute(second_difference, field, axis) / 8
     return field
 

@@ -225,6 +225,11 @@ def greatest_depth(volume: Volume) -> float:
     most, density = sigma_t.amax(0), volume.density.detach()
     if not any(density.stride()):
         density = density[:1, :1, :1]  # the same in all cells, which may be too many to be made
-    sides = list(zip(volume.grid.spacing, volume.grid.shape, strict=True))
-    widths = [width for width, cells in sides if cells > 1] or list(volume.grid.spacing)
-    return float((density * most).amax()) * sum(widths) / len(widths)
+    return float((density * most).amax()) * mean_side(volume.grid)
+
+
+def mean_side(grid: Grid) -> float:
+    """The mean side of a cell [u], along axes of more than one cell if there are any."""
+    sides = list(zip(grid.spacing, grid.shape, strict=True))
+    widths = [width for width, cells in sides if cells > 1] or list(grid.spacing)
+    return sum(widths) / len(widths)

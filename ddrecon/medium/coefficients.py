@@ -133,7 +133,8 @@ class Medium:
     cell. `peak` is f kappa_s per unit of the extinction's field: times a mass, it is the depth x of
     E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it varies, and None without a peak.
     `emission` j [C, z, y, x] is the radiance that a unit of length adds (E2.11), None where nothing
-    glows. `support` and `index` are the volume's.
+    glows. `support` and `index` are the volume's. Sweeps go through halves of its cells along the
+    axes `halved` (E2.18): means of cells hold these `parts`, None where nothing is halved.
     """
 
     grid: Grid
@@ -148,6 +149,8 @@ class Medium:
     support: Tensor | None = None
     emission: Tensor | None = None
     index: float = 1.0
+    halved: str = ""
+    parts: Medium | None = None
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -167,7 +170,8 @@ class Medium:
         """One that scatters of even light of radiance 1 what this one emits (E2.11)."""
         assert self.emission is not None
         scale = self.emission.new_ones(1, 1, 1, 1)
-        return replace(self, remaining=Coefficient(scale, self.emission))
+        parts = None if self.parts is None else self.parts.emitting
+        return replace(self, remaining=Coefficient(scale, self.emission), parts=parts)
 
     @property
     def has_flux(self) -> bool:

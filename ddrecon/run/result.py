@@ -53,7 +53,7 @@ def describe_result(
     """
     described = {key: value for key, value in describe(scene_file).items() if key != "optimize"}
     # A scene file that leaves out rounds and samples would choose them anew, by its own density.
-    for key in ("transport_rounds", "degree", "refine", "refine_along", "receive"):
+    for key in ("transport_rounds", "degree", "refine", "refine_along", "halve_along", "receive"):
         if (value := getattr(scene.diffusion, key)) is not None:
             described["diffusion"][key] = value
     described["render"]["steps_per_voxel"] = scene.render.steps

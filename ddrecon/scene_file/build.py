@@ -235,7 +235,9 @@ def needs_of_scene(
     return Needs(
         resolution=combined.grid.shape[::-1],
         # Light is computed in cells so many times as narrow along these axes.
-        numbers=numbers * diffusion.times ** len(diffusion.refine_along),
+        numbers=numbers
+        * diffusion.times ** len(diffusion.refine_along)
+        * 2 ** len(diffusion.halved),
         pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
         size=combined.density.element_size(),
     )

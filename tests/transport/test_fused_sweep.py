@@ -9,6 +9,7 @@ import torch
 from media import half_empty, random_values
 from twins import assert_same, assert_twins, differentiate
 
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.grid import Grid
 from ddrecon.light.moments import cut
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -49,6 +50,7 @@ class Case:
     is_island: bool = False
     periodic: tuple[int, ...] = ()
     index: float = 1.0
+    halved: str = ""
 
     @property
     def grid(self):
@@ -83,7 +85,8 @@ class Case:
         density, sigma_a, sigma_s = (values[name] for name in ("density", "sigma_a", "sigma_s"))
         g = values.get("g", density.new_zeros(()))
         volume = Volume(self.grid, density, sigma_a, sigma_s, g, index=self.index)
-        return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
+        medium = scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
+        return average_cells(replace(medium, halved=self.halved)) if self.halved else medium
 
 
 def moments_of(case):
@@ -131,6 +134,11 @@ CASES = {
     "island-high": Case((25, 40, 7), colors=1, moments=1, is_island=True),
     "around-zx": Case((3, 4, 5), periodic=(0, 2)),
     "around-cubes": Case(periodic=(0, 1), spacing=CUBES, colors=1, varies=True),
+    "around-yx": Case(periodic=(1, 2), directions=44),
+    "around-y": Case((3, 4, 5), CUBES, periodic=(1,), directions=96, moments=4),
+    "around-x": Case((4, 3, 5), THIN, periodic=(2,), directions=44),
+    "around-few": Case((3, 2, 2), CUBES, periodic=(1, 2), directions=44, depth=0.05),
+    "halves": Case((3, 4, 5), periodic=(1, 2), directions=44, halved="xy"),
     "refracting": Case(index=1.4, known=4),
 }
 
