@@ -203,22 +203,23 @@ def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
     """Places (row, column) of `samples` rays in a pixel, spread evenly over its area.
 
     No two share a row or a column: where pixels fit cells of a volume, rays of a regular grid would
-    all see the same places of cells. They are a lattice of rank 1 but for its origin, whose places
-    lie as far apart as may be (Niederreiter 1992, doi:10.1137/1.9781611970081, chapter 5).
+    all see the same places of cells. They are a lattice of rank 1, with its origin or without, and
+    as far apart as may be (Niederreiter 1992, doi:10.1137/1.9781611970081, chapter 5).
     """
-    size = samples + 1
-    rows = torch.arange(1, size)
 
-    def columns_of(step: int) -> Tensor:
-        return rows * step % size
+    def apart(lattice: tuple[int, int]) -> float:
+        size, step = lattice
+        rows = torch.arange(1, size)
+        sides = torch.stack([rows, rows * step % size])
+        squares = (torch.minimum(sides, size - sides) ** 2).sum(0)
+        return float(squares.amin()) / size**2 if size > 1 else 0.0
 
-    def apart(step: int) -> int:
-        sides = torch.stack([rows, columns_of(step)])
-        return int((torch.minimum(sides, size - sides) ** 2).sum(0).amin())
-
-    step = max((n for n in range(1, size) if math.gcd(n, size) == 1), key=apart)
-    places = (torch.stack([rows, columns_of(step)], 1).double() - 0.5) / samples
-    return [(row, column) for row, column in places.tolist()]
+    sizes = samples + 1, samples
+    lattices = [(s, n) for s in sizes for n in range(1, s + 1) if math.gcd(n, s) == 1]
+    size, step = max(lattices, key=apart)
+    rows = torch.arange(size - samples, size)
+    places = torch.stack([rows, rows * step % size], 1) - (size - samples)
+    return [(row, column) for row, column in ((places.double() + 0.5) / samples).tolist()]
 
 
 def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:

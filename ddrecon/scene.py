@@ -151,6 +151,7 @@ def _unsupported(scene: Scene) -> Iterator[str]:
         yield from _unrepeated(scene)
     refracted = {
         "ground": ground is not None,
+        "diffusion.halve_along": bool(settings.halved),
         "diffusion.scheme: printed": is_printed,
         "diffusion.model: flux_limited": is_limited,
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),

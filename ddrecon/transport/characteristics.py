@@ -12,6 +12,7 @@ All but the recurrence I_out = passed I_in + source is computed at once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +34,7 @@ Ends = tuple[Tensor, Tensor, Tensor]
 """Light on faces of the box, in the layout of a course: across slices [C, rows, columns], rows
 [slices, C, columns] and columns [slices, C, rows].
 """
-DOUBLINGS, MOST_LAPS = 10, 64
+DOUBLINGS, MOST_LAPS = 10, 2**10
 """Light that goes around is followed for 2^10 periods where it keeps to whole cells; else until
 nothing more comes but rounding, or for so many.
 """
@@ -93,6 +94,12 @@ class Characteristic:
         moved = {SLICES: float(self.forward), ROWS: row, COLUMNS: column}
         return [moved[self.order.index(1 + axis)] for axis in range(3)]
 
+    def count_laps(self, rounding: float) -> int:
+        """Laps after which nothing is left of light but `rounding`: 0 where it leaves nowhere."""
+        ends = zip(self.drift, self.wraps[1:], strict=True)
+        remains = math.prod(1 - abs(float(moved)) for moved, is_around in ends if not is_around)
+        return laps_until(remains, self.count, rounding) if remains < 1 else 0
+
     def lay(self, field: Tensor) -> Tensor:
         """`field` [C, z, y, x] as [slices, C, rows, columns]."""
         return field.permute(self.order).contiguous()
@@ -100,6 +107,12 @@ class Characteristic:
     def lift(self, values: Tensor) -> Tensor:
         """The inverse of `lay`."""
         return values.permute([self.order.index(dim) for dim in range(4)])
+
+
+def laps_until(remains: float, slices: int, rounding: float) -> int:
+    """Laps of so many `slices`, in each of which so much `remains`, until `rounding` is left."""
+    lost = -slices * math.log(max(remains, rounding))
+    return min(math.ceil(-math.log(rounding) / max(lost, 1e-9)), MOST_LAPS)
 
 
 def radiance_along(
@@ -209,7 +222,10 @@ def enter_again(
         is_parallel or not course.wraps[0]
         for is_parallel, course in zip(is_whole, courses, strict=True)
     ]
-    for _ in range(MOST_LAPS):
+    # Where all is dark now, changes go around nevertheless: as long as anything of them is left.
+    rounding = torch.finfo(nothing[0].dtype).eps
+    fewest = [course.count_laps(rounding) for course in courses]
+    for lap in range(MOST_LAPS):
         if all(rests):
             break
         before, after = entering, leave(entering)
@@ -218,8 +234,8 @@ def enter_again(
             for old, new, is_steady in zip(before, after, rests, strict=True)
         ]
         rests = [
-            is_steady or _is_at_rest(old, new)
-            for is_steady, old, new in zip(rests, before, after, strict=True)
+            is_steady or _is_at_rest(old, new, rounding, lap >= least)
+            for is_steady, old, new, least in zip(rests, before, after, fewest, strict=True)
         ]
     if not any(is_whole):
         return entering
@@ -233,9 +249,10 @@ def enter_again(
     ]
 
 
-def _is_at_rest(before: Tensor, after: Tensor) -> bool:
-    rounding = torch.finfo(after.dtype).eps
-    return bool((after - before).abs().max() <= rounding * after.abs().max())
+def _is_at_rest(before: Tensor, after: Tensor, rounding: float, may_be_dark: bool) -> bool:
+    largest = after.abs().max()
+    is_steady = (after - before).abs().max() <= rounding * largest
+    return bool(is_steady & ((largest > 0) | may_be_dark))
 
 
 def _double(entering: Tensor, share: Tensor, course: Characteristic) -> Tensor:

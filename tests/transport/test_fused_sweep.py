@@ -138,6 +138,7 @@ CASES = {
     "around-y": Case((3, 4, 5), CUBES, periodic=(1,), directions=96, moments=4),
     "around-x": Case((4, 3, 5), THIN, periodic=(2,), directions=44),
     "around-few": Case((3, 2, 2), CUBES, periodic=(1, 2), directions=44, depth=0.05),
+    "around-empty": Case((4, 5, 3), (0.5, 2.0, 1.9), periodic=(1, 2), directions=96, depth=0.0),
     "halves": Case((3, 4, 5), periodic=(1, 2), directions=44, halved="xy"),
     "refracting": Case(index=1.4, known=4),
 }

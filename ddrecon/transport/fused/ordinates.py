@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.transport.characteristics import DOUBLINGS, Characteristic, Direction
+from ddrecon.transport.characteristics import Characteristic, Direction, laps_until
 from ddrecon.transport.sweep import sweep_rule
 
 POINTS = 4
@@ -101,8 +101,7 @@ class Ordinate:
         laps = 0
         if axis > 0 and moved[1] and not stays and 1 in grid.periodic:
             # In every row a part of light leaves for the next plane.
-            lost = -math.log(max(1 - abs(moved[0]), rounding)) * grid.shape[1]
-            laps = min(math.ceil(-math.log(rounding) / max(lost, 1e-9)), 2**DOUBLINGS)
+            laps = laps_until(1 - abs(moved[0]), grid.shape[1], rounding)
         return Ordinate(number, axis, step, tuple(moved), points, weights, laps, stays)
 
     @property
