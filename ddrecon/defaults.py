@@ -76,7 +76,8 @@ def choose_diffusion(
         rounds = MOST_ROUNDS
     receive = PARTS if depth / times > thin else 1
     chosen: dict[str, Any] = {"transport_rounds": rounds, "degree": degree, "refine": times}
-    chosen |= {"receive": receive, "halve_along": _choose_halves(volume, depth, times, along)}
+    halved = _choose_halves(volume, media, depth, times, along)
+    chosen |= {"receive": receive, "halve_along": halved}
     added = {key: value for key, value in chosen.items() if getattr(settings, key) is None}
     if settings.refine is None and times > 1 and along != settings.refine_along:
         reasons.append("too many cells to divide all")
@@ -104,19 +105,20 @@ def _choose_cells(
     return times, along
 
 
-def _choose_halves(volume: Volume, depth: float, times: int, along: str) -> str:
+def _choose_halves(
+    volume: Volume, media: Sequence[Volume], depth: float, times: int, along: str
+) -> str:
     """The axes along which sweeps go through halves of cells, as of `choose_diffusion`.
 
-    Across its mean side a cell of `volume` has so many optical depths at most; along these axes it
-    is divided by `times`.
+    Across its mean side a cell of `volume` has so many optical depths at most; along `along` it is
+    divided by `times`.
     """
     finer, mean = volume.grid.refine(times, along), mean_side(volume.grid)
-    sides = zip("zyx", finer.shape, finer.spacing, strict=True)
-    axes = "".join(
-        axis
-        for axis, cells, side in reversed([*sides])
-        if cells > 1 and side > WIDE * min(finer.spacing) and depth * side > FINER * mean
-    )
+    shapes = zip("xyz", finer.shape[::-1], finer.spacing[::-1], strict=True)
+    sides = {axis: side for axis, cells, side in shapes if cells > 1}
+    least = max(WIDE * min(sides.values(), default=0.0), FINER * mean / max(depth, 1e-9))
+    varies = _axes_that_vary(media)
+    axes = "".join(axis for axis, side in sides.items() if side > least and axis in varies)
     fits = volume.index == 1 and finer.refine(2, axes).cells <= 4 * MOST_CELLS
     return axes if axes and fits else "none"
 

@@ -133,7 +133,8 @@ class Slicing:
         Light meets the slices in their order. Of axes crossed equally fast it is the first, those
         that are `periodic` last.
         """
-        axis = max(range(3), key=lambda a: abs(speed[a]) * (1 - NEARLY * (a + 3 * (a in periodic))))
+        later = [NEARLY * (1 + a) * (a in periodic) for a in range(3)]
+        axis = max(range(3), key=lambda a: abs(speed[a]) * (1 - later[a]))
         row, column = across(axis)
         return Slicing(axis, (1 + axis, 0, 1 + row, 1 + column), speed[axis] < 0)
 

@@ -1,6 +1,5 @@
 """View rays: closed forms, and plain sums of E2.1 to E2.3 on other nodes."""
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -21,7 +20,7 @@ from media import (
 from scenes import VIEWS
 from torch.nn.functional import grid_sample, pad
 
-from ddrecon.cameras import Rays, cast_rays
+from ddrecon.cameras import Rays, cast_rays, subpixel_offsets
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -134,8 +133,7 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
     absorbing = {"sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
     scene = make_scene(torch.ones(3, 5, 4, dtype=torch.float64), **absorbing)
     image = render(replace(scene, render=RenderSettings(samples_per_pixel=4, steps_per_voxel=2)))[0]
-    offsets = itertools.product((0.25, 0.75), repeat=2)
-    bundles = [cast_rays(scene.views[0].camera, offset) for offset in offsets]
+    bundles = [cast_rays(scene.views[0].camera, offset) for offset in subpixel_offsets(4)]
     lengths = torch.stack([chords(scene.volume.grid, bundle) for bundle in bundles])
     for color, sigma in enumerate(scene.volume.sigma_a):
         expected = torch.exp(-sigma * lengths).mean(0)
