@@ -264,7 +264,7 @@ def known_cases(folder: Path, place: Path) -> Iterator[KnownCase]:
         yield case["case"], path, Traced(full, noise)
 
 
-def own_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> Iterator[KnownCase]:
+def media_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> Iterator[KnownCase]:
     """The same of `cases` of ours."""
     for case in cases:
         path = case.write(place)
@@ -367,7 +367,7 @@ def main() -> None:
         elif given.what == "eleven":
             print_errors(known_cases(references, place))
         else:
-            print_errors(own_cases(CASES[given.what], references, place))
+            print_errors(media_cases(CASES[given.what], references, place))
 
 
 if __name__ == "__main__":

@@ -78,8 +78,8 @@ class Case:
 
 def coarsened(density: Array, shape: Sequence[int]) -> Array:
     """Means of `density` over the cells of a grid of `shape`."""
-    for axis, (count, own) in enumerate(zip(shape, density.shape, strict=True)):
-        parts = np.repeat(density, math.lcm(count, own) // own, axis)
+    for axis, (count, cells) in enumerate(zip(shape, density.shape, strict=True)):
+        parts = np.repeat(density, math.lcm(count, cells) // cells, axis)
         parts = parts.reshape(*parts.shape[:axis], count, -1, *parts.shape[axis + 1 :])
         density = parts.mean(axis + 1)
     return density

@@ -143,7 +143,7 @@ def show_optics(
             errors.append(f"{relative_l1(ours, true):.2f}")
         words = f"relative L1 error of absorption and scattering {', '.join(errors)}"
         if is_g_sought:
-            found, alone = (each.number("g") for each in runs.values())
+            found, alone = (run.number("g") for run in runs.values())
             words = f"g {found:.3f}, alone {alone:.3f}, in truth -0.802; {words}"
         return pairs, words
 

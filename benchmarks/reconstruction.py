@@ -96,7 +96,7 @@ def print_capture(folder: Path) -> None:
         [frame["transform_matrix"] for frame in told],
         [values[f"{name}.camera"]["matrix"] for name in names],
     )
-    given, found = (cameras_off(each, truth, CAPTURE / "density.npz").T for each in poses)
+    given, found = (cameras_off(pose, truth, CAPTURE / "density.npz").T for pose in poses)
     print_header("what", "given", "found")
     print_row("held-out picture, as displayed", "", f"{row['held out'][0]:.1f} dB")
     print_row("density, relative L1 error", "", *row["L1"])

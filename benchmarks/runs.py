@@ -64,6 +64,6 @@ def read_plume() -> Tensor:
     return torch.tensor(read_field(ROOT / "data/plume/density.npz", "density").values)
 
 
-def apart(one: Tensor, other: Tensor) -> float:
+def apart(result: Tensor, reference: Tensor) -> float:
     """How far two tensors are apart, relative to the second."""
-    return float((one.cpu() - other.cpu()).norm() / other.norm().clamp(min=1e-300))
+    return float((result.cpu() - reference.cpu()).norm() / reference.norm().clamp(min=1e-300))

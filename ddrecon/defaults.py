@@ -59,10 +59,10 @@ def choose_diffusion(
     left_out = None in (*choices, settings.halve_along)
     if not settings.rounds or not left_out:
         return settings, ""
-    left = float(volume.phase.moments(3)[:, 2].abs().max())
+    second_moment = float(volume.phase.moments(3)[:, 2].abs().max())
     if any(name.partition(".")[0] in ("g", "phase") for name in optimized):
-        left = max(left, OPTIMIZED)
-    reasons = [f"a second moment of {left:.3g} of the phase function"]
+        second_moment = max(second_moment, OPTIMIZED)
+    reasons = [f"a second moment of {second_moment:.3g} of the phase function"]
     depth, is_flat = sum(map(greatest_depth, media)), _is_flat(media)
     if any(name.endswith("density") for name in optimized):
         depth, is_flat = 0.0, False
@@ -70,7 +70,9 @@ def choose_diffusion(
     times, along = _choose_cells(settings, volume, media, depth / thin)
     if depth > thin:
         reasons.append(f"cells of {depth:.3g} optical depths")
-    rounds, degree, causes = _choose_rounds(volume, optimized, left, depth / times, is_flat)
+    rounds, degree, causes = _choose_rounds(
+        volume, optimized, second_moment, depth / times, is_flat
+    )
     reasons += causes
     if settings.transport_tolerance is not None:
         rounds = MOST_ROUNDS
@@ -124,12 +126,15 @@ def _choose_halves(
 
 
 def _choose_rounds(
-    volume: Volume, optimized: Collection[str], left: float, depth: float, is_flat: bool
+    volume: Volume, optimized: Collection[str], second_moment: float, depth: float, is_flat: bool
 ) -> tuple[int, int, list[str]]:
-    """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
+    """Rounds, their degree, and why, as of `choose_diffusion`."""
     reasons, glows = list[str](), [volume.emission, volume.black_body]
     turns_back = float(volume.phase.peak_tail(3, 1, -1).max()) > BACKWARD
-    rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
+    rounds, degree = (
+        1 + sum(second_moment > bound for bound in MORE_ROUNDS),
+        3 if second_moment > FEW_ANGLES else 1,
+    )
     if is_flat or turns_back:
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
         rounds, degree = rounds + 1 + (depth > THICK), 5

@@ -24,13 +24,11 @@ THIN = 1.5
 def average_cells(medium: Medium) -> Medium:
     """`medium` with cells' means of fields that are linear between their centers.
 
-    Beyond the outermost centers they stay as they are there. So it is in the `parts` of cells that
-    are `halved`, a half of which is even along its axis about the middle.
+    Beyond the outermost centers they stay as they are there. Of a medium that is
+    `halved` the `halves` of cells have theirs: between a center and a face fields are linear.
     """
-    grid, cells = (
-        medium.grid,
-        medium.mapped(lambda field: apply_around(average, field, medium.grid), "emission"),
-    )
+    grid = medium.grid
+    cells = medium.mapped(lambda field: apply_around(average, field, grid), "emission")
     if not medium.halved:
         return cells
     finer = grid.refine(2, medium.halved)
@@ -40,7 +38,7 @@ def average_cells(medium: Medium) -> Medium:
         averaged = apply_around(functools.partial(_average_along, axes=whole), field, grid)
         return resample(averaged, finer)
 
-    return replace(cells, parts=medium.put(finer, halve))
+    return replace(cells, halves=medium.put(finer, halve))
 
 
 def average(field: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ class Medium:
     E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it varies, and None without a peak.
     `emission` j [C, z, y, x] is the radiance that a unit of length adds (E2.11), None where nothing
     glows. `support` and `index` are the volume's. Sweeps go through halves of its cells along the
-    axes `halved` (E2.18): means of cells hold these `parts`, None where nothing is halved.
+    axes `halved` (E2.18): means of cells hold these `halves`, None where there are none.
     """
 
     grid: Grid
@@ -150,7 +150,7 @@ class Medium:
     emission: Tensor | None = None
     index: float = 1.0
     halved: str = ""
-    parts: Medium | None = None
+    halves: Medium | None = None
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -170,8 +170,8 @@ class Medium:
         """One that scatters of even light of radiance 1 what this one emits (E2.11)."""
         assert self.emission is not None
         scale = self.emission.new_ones(1, 1, 1, 1)
-        parts = None if self.parts is None else self.parts.emitting
-        return replace(self, remaining=Coefficient(scale, self.emission), parts=parts)
+        halves = None if self.halves is None else self.halves.emitting
+        return replace(self, remaining=Coefficient(scale, self.emission), halves=halves)
 
     @property
     def has_flux(self) -> bool:

@@ -162,8 +162,8 @@ def drive(job: Job, place: Path | None, is_resumed: bool = False) -> None:
         except (DivergenceError, RanksError) as error:
             save()
             if place is not None:
-                kept = f"the state after {job.iteration} iterations is kept in {place / LAST}"
-                error.args = (f"{error}; {kept}: go on from it with --resume",)
+                advice = f"the state after {job.iteration} iterations is kept in {place / LAST}"
+                error.args = (f"{error}; {advice}: go on from it with --resume",)
             raise
         save()
 

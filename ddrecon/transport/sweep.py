@@ -21,8 +21,8 @@ from ddrecon.numerics.layout import NEARLY, apply_around
 from ddrecon.numerics.remember import constant
 from ddrecon.numerics.sphere import harmonics, sphere_quadrature
 from ddrecon.transport.characteristics import Direction, Ends, radiance_along
+from ddrecon.transport.halves import mean_of_halves, put_in_halves
 from ddrecon.transport.mirror import Mirror
-from ddrecon.transport.parts import mean_of_parts, put_in_parts
 
 DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 96}
 """By the degree to which angles are kept. Both rules are exact for fluxes through faces."""
@@ -93,9 +93,9 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    scatters, cells, parts = _scatter(light, source, factors), medium, medium.parts
-    if parts is not None:
-        medium, scatters = parts, put_in_parts(cells, parts, scatters)
+    scatters, cells, halves = _scatter(light, source, factors), medium, medium.halves
+    if halves is not None:
+        medium, scatters = halves, put_in_halves(cells, halves, scatters)
     # p_0 is 1: the first moment is L0 + Q0.
     gradient = steep_gradient(medium, scatters[0][0], directions)
     emitted = fill(emitted_light(medium, scatters, inflow), medium.degree)
@@ -106,8 +106,8 @@ def sweep_change(
     swept = sweep(medium.grid, medium.extinction.value, emitted, gradient, directions, mirror)
     if mirror is not None:
         mirror.end(swept)
-    if parts is not None:
-        swept = mean_of_parts(cells, parts, swept)
+    if halves is not None:
+        swept = mean_of_halves(cells, halves, swept)
     low, high = cut(swept)
     low = low if outside is None else low + cut(outside)[0]
     return low - light[0] if len(low) == len(light[0]) else add(low, -light[0]), high

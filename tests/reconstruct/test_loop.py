@@ -48,8 +48,8 @@ def test_the_scene_itself_is_left_alone(coarse_ball):
 def test_test_views_do_not_influence_the_result(coarse_ball):
     views = [replace(view, image=view.image * (not view.is_test)) for view in coarse_ball.views]
     spoiled = replace(coarse_ball, views=views)
-    one, other = (optimize(scene, iterations=3).scene.volume for scene in (coarse_ball, spoiled))
-    assert torch.equal(one.density, other.density)
+    volumes = [optimize(scene, iterations=3).scene.volume for scene in (coarse_ball, spoiled)]
+    assert torch.equal(volumes[0].density, volumes[1].density)
 
 
 def test_a_view_of_weight_2_counts_as_two(coarse_ball):

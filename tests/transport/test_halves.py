@@ -14,7 +14,7 @@ from ddrecon.lighting import fluence
 from ddrecon.medium.coefficients import Volume, resample, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
-from ddrecon.transport.parts import mean_of_parts, put_in_parts
+from ddrecon.transport.halves import mean_of_halves, put_in_halves
 from ddrecon.transport.sweep import sweep_change
 
 
@@ -31,23 +31,21 @@ def cells_of(density, albedo=0.9, halved="xy", periodic=(1, 2)):
 @pytest.mark.parametrize("periodic", [(1, 2), ()], ids=str)
 def test_halves_have_the_means_of_cells(periodic):
     cells = cells_of(random_values(3, 4, 5, dtype=torch.float64), periodic=periodic)
-    halves = cells.parts
-    for whole, parts in (
-        (cells.extinction, halves.extinction),
-        (cells.remaining, halves.remaining),
-    ):
-        torch.testing.assert_close(resample(parts.value, cells.grid), whole.value)
+    halves = cells.halves
+    for name in ("extinction", "remaining"):
+        whole, half = (getattr(medium, name).value for medium in (cells, halves))
+        torch.testing.assert_close(resample(half, cells.grid), whole)
 
 
 def test_what_cells_scatter_and_lose_is_kept():
     cells = cells_of(random_values(3, 4, 5, dtype=torch.float64))
     moments = random_values(16, 1, 3, 4, 5, seed=1, dtype=torch.float64)
-    parts = torch.cat(put_in_parts(cells, cells.parts, cut(moments)))
-    scattered = resample(cells.parts.remaining.value * parts, cells.grid)
-    lost = cells.extinction.value * mean_of_parts(cells, cells.parts, parts)
-    for kept, coefficient in ((scattered, cells.remaining), (lost, cells.extinction)):
+    halved = torch.cat(put_in_halves(cells, cells.halves, cut(moments)))
+    scattered = resample(cells.halves.remaining.value * halved, cells.grid)
+    lost = cells.extinction.value * mean_of_halves(cells, cells.halves, halved)
+    for result, coefficient in ((scattered, cells.remaining), (lost, cells.extinction)):
         # But for what counts cells alike that have nothing.
-        torch.testing.assert_close(kept, coefficient.value * moments, rtol=2e-3, atol=2e-3)
+        torch.testing.assert_close(result, coefficient.value * moments, rtol=2e-3, atol=2e-3)
 
 
 def test_a_white_furnace_stays_white():
